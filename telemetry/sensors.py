@@ -1,0 +1,237 @@
+"""MAVLink columns to SI samples: which message feeds which sensor, in which units, and which values are no measurement.
+
+Several messages can feed one sensor. They are ranked by how close they are to the instrument, and once a better one
+has been heard from a component the lesser ones of that component are no longer used. Stale but plausible values never
+become measurements: a fix below three dimensions, a field that ``fields_updated`` leaves out, a fix repeated under
+the same time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from telemetry.messages import AirData, Altitude, Attitude, Gnss, Imu, Message
+
+STANDARD_GRAVITY = 9.80665
+SEA_LEVEL_PRESSURE = 101325.0
+SEA_LEVEL_DENSITY = 1.225
+
+GNSS_SIGMA = 2.5  # m, horizontal, per axis, at HDOP 1 when the receiver states no accuracy
+GNSS_VELOCITY_SIGMA = 0.3  # m/s
+ALTIMETER_SIGMA = 0.7  # m
+
+Columns = dict[str, NDArray[Any]]
+
+
+def pressure_altitude(pressure: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Altitude in the ICAO standard atmosphere up to 11 km, m, from static pressure, Pa (NaN stays NaN)."""
+    return 44330.769 * (1.0 - (pressure / SEA_LEVEL_PRESSURE) ** 0.19026324)
+
+
+def _calibrated_airspeed(differential: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Incompressible calibrated airspeed, m/s; a negative pressure, as at rest, gives a negative airspeed, not a root
+    of it.
+    """
+    return np.sign(differential) * np.sqrt(2.0 * np.abs(differential) / SEA_LEVEL_DENSITY)
+
+
+def _vector(values: NDArray[Any], names: tuple[str, str, str], scale: float) -> NDArray[np.float64]:
+    return np.stack([values[name].astype(np.float64) for name in names], axis=1) * scale
+
+
+def _unless(values: NDArray[Any], unknown: int, scale: float) -> NDArray[np.float64]:
+    """Scale integers, with the value that means "unknown" as NaN."""
+    return np.where(values == unknown, np.nan, values.astype(np.float64) * scale)
+
+
+def _updated(values: NDArray[Any], bits: int) -> NDArray[np.bool_]:
+    return np.asarray((values["fields_updated"] & bits) == bits)
+
+
+def _highres_imu(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    return _updated(values, 0x3F), {
+        "specific_force": _vector(values, ("xacc", "yacc", "zacc"), 1.0),
+        "angular_rate": _vector(values, ("xgyro", "ygyro", "zgyro"), 1.0),
+    }
+
+
+def _scaled_imu(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    return np.ones(len(values), np.bool_), {
+        "specific_force": _vector(values, ("xacc", "yacc", "zacc"), STANDARD_GRAVITY * 1e-3),
+        "angular_rate": _vector(values, ("xgyro", "ygyro", "zgyro"), 1e-3),
+    }
+
+
+def _attitude(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    angles = {"phi": values["roll"], "theta": values["pitch"], "psi": values["yaw"]}
+    return np.ones(len(values), np.bool_), {name: angle.astype(np.float64) for name, angle in angles.items()}
+
+
+def _attitude_quaternion(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    w, x, y, z = (values[name].astype(np.float64) for name in ("q1", "q2", "q3", "q4"))
+    return w * w + x * x + y * y + z * z > 0.5, {
+        "phi": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        "theta": np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+        "psi": np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    }
+
+
+def _altitude(altitude: NDArray[np.float64], pressure: NDArray[np.float64]) -> Columns:
+    return {"altitude": altitude, "pressure": pressure, "sigma": np.full(len(altitude), ALTIMETER_SIGMA)}
+
+
+def _highres_altitude(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    pressure = np.where(_updated(values, 0x200), values["abs_pressure"].astype(np.float64) * 100.0, np.nan)
+    pressure[~(pressure > 0)] = np.nan
+    altitude = np.where(_updated(values, 0x800), values["pressure_alt"].astype(np.float64), pressure_altitude(pressure))
+    return np.isfinite(altitude), _altitude(altitude, pressure)
+
+
+def _scaled_pressure(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    pressure = values["press_abs"].astype(np.float64) * 100.0
+    return pressure > 0, _altitude(pressure_altitude(np.where(pressure > 0, pressure, np.nan)), pressure)
+
+
+def _vfr_hud(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    airspeed = values["airspeed"].astype(np.float64)
+    return np.isfinite(airspeed), {"airspeed": airspeed, "differential_pressure": np.full(len(values), np.nan)}
+
+
+def _highres_air(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    pressure = values["diff_pressure"].astype(np.float64) * 100.0
+    return _updated(values, 0x400), {"airspeed": _calibrated_airspeed(pressure), "differential_pressure": pressure}
+
+
+def _gps_raw_int(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    rows = len(values)
+    dilution = np.where((values["eph"] == 65535) | (values["eph"] == 0), 1.0, values["eph"] * 0.01)
+    vertical = np.where((values["epv"] == 65535) | (values["epv"] == 0), 1.5 * dilution, values["epv"] * 0.01)
+    sigma = np.empty((rows, 3))
+    # The accuracies are extension fields: zero means that the sender does not know them.
+    sigma[:, 0] = np.where(values["h_acc"] > 0, values["h_acc"] * 1e-3, GNSS_SIGMA * dilution)
+    sigma[:, 1] = np.where(values["v_acc"] > 0, values["v_acc"] * 1e-3, GNSS_SIGMA * vertical)
+    sigma[:, 2] = np.where(values["vel_acc"] > 0, values["vel_acc"] * 1e-3, GNSS_VELOCITY_SIGMA)
+    speed = _unless(values["vel"], 65535, 1e-2)
+    course = np.deg2rad(_unless(values["cog"], 65535, 1e-2))
+    velocity = np.stack([speed * np.cos(course), speed * np.sin(course), np.full(rows, np.nan)], axis=1)
+    inside = (np.abs(values["lat"].astype(np.int64)) <= 900_000_000) & (
+        np.abs(values["lon"].astype(np.int64)) <= 1_800_000_000
+    )
+    return (values["fix_type"] >= 3) & (values["fix_type"] <= 8) & inside, {
+        "latitude": np.deg2rad(values["lat"] * 1e-7),
+        "longitude": np.deg2rad(values["lon"] * 1e-7),
+        "altitude": values["alt"] * 1e-3,
+        "velocity": velocity,
+        "sigma": sigma,
+        "satellites": np.where(values["satellites_visible"] == 255, -1, values["satellites_visible"].astype(np.int64)),
+    }
+
+
+class Feed(NamedTuple):
+    """One message that can feed a sensor: of those heard, the lowest rank is used."""
+
+    msgid: int
+    kind: type[Message]
+    rank: int
+    convert: Callable[[NDArray[Any]], tuple[NDArray[np.bool_], Columns]]
+
+
+FEEDS = (
+    Feed(105, Imu, 0, _highres_imu),
+    Feed(26, Imu, 1, _scaled_imu),
+    Feed(27, Imu, 2, _scaled_imu),
+    Feed(30, Attitude, 0, _attitude),
+    Feed(31, Attitude, 1, _attitude_quaternion),
+    Feed(105, Altitude, 0, _highres_altitude),
+    Feed(29, Altitude, 1, _scaled_pressure),
+    Feed(105, AirData, 0, _highres_air),
+    Feed(74, AirData, 1, _vfr_hud),
+    Feed(24, Gnss, 0, _gps_raw_int),
+)
+
+
+class Sensors:
+    """The sensors of one component of one vehicle.
+
+    Parameters
+    ----------
+    vehicle : int
+    source : str
+        ``"link/component"`` for the messages.
+    """
+
+    def __init__(self, vehicle: int, source: str) -> None:
+        self._vehicle = vehicle
+        self._source = source
+        self._rank: dict[type[Message], int] = {}
+        self._last_fix: dict[int, int] = {}
+
+    def samples(
+        self,
+        decoded: dict[int, tuple[NDArray[np.int64], NDArray[Any]]],
+        t: NDArray[np.int64],
+        t_rx: NDArray[np.int64],
+        boot: int,
+    ) -> list[Message]:
+        """What a batch of frames of one boot epoch measures.
+
+        Parameters
+        ----------
+        decoded : dict of int to (int64 array, structured array)
+            Per message id the rows of the batch, in order of arrival, and their payloads.
+        t, t_rx : int64 array
+            Times of the whole batch, indexed by those rows.
+        boot : int
+
+        Returns
+        -------
+        list of Message
+            One per sensor heard, rows in order of arrival.
+        """
+        messages: list[Message] = []
+        for kind in (Imu, Attitude, AirData, Altitude, Gnss):
+            candidates = []
+            for feed in FEEDS:
+                if feed.kind is kind and feed.msgid in decoded:
+                    rows, values = decoded[feed.msgid]
+                    valid, columns = feed.convert(values)
+                    candidates.append((rows[valid], feed.rank, {name: c[valid] for name, c in columns.items()}))
+            candidates = [c for c in candidates if len(c[0])]
+            if candidates:
+                message = self._merge(kind, candidates, t, t_rx, boot)
+                if message is not None:
+                    messages.append(message)
+        return messages
+
+    def _merge(
+        self,
+        kind: type[Message],
+        candidates: list[tuple[NDArray[np.int64], int, Columns]],
+        t: NDArray[np.int64],
+        t_rx: NDArray[np.int64],
+        boot: int,
+    ) -> Message | None:
+        rows = np.concatenate([c[0] for c in candidates])
+        rank = np.concatenate([np.full(len(c[0]), c[1]) for c in candidates])
+        order = np.argsort(rows, kind="stable")
+        rows, rank = rows[order], rank[order]
+        best = np.minimum.accumulate(np.minimum(rank, self._rank.get(kind, 99)))
+        self._rank[kind] = int(best[-1])
+        keep = rank == best
+        if kind is Gnss:
+            keep &= self._new_fix(t[rows], boot)
+        if not keep.any():
+            return None
+        columns = {name: np.concatenate([c[2][name] for c in candidates])[order][keep] for name in candidates[0][2]}
+        rows = rows[keep]
+        return kind(vehicle=self._vehicle, source=self._source, boot=boot, t=t[rows], t_rx=t_rx[rows], **columns)
+
+    def _new_fix(self, t: NDArray[np.int64], boot: int) -> NDArray[np.bool_]:
+        """Receivers repeat a fix until there is a new one: the same time again is no new measurement."""
+        before = np.concatenate([[self._last_fix.get(boot, np.iinfo(np.int64).min)], t[:-1]])
+        self._last_fix = {boot: int(t[-1])}
+        return np.asarray(t != before)

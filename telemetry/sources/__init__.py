@@ -1,0 +1,3 @@
+"""Where bytes come from: one file per kind of source, all yielding `telemetry.frames.Frames` in the order of
+arrival.
+"""

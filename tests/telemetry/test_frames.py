@@ -1,0 +1,235 @@
+"""Frames are found wherever they begin, and every byte is accounted for."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import fastcrc
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from telemetry.frames import STX1, STX2, TlogScanner, join, scan_datagrams, write_junk, write_record
+from telemetry.mavlink import Dialect
+from tests.telemetry.wire import DATA, LOGS, Sender, tlog
+
+DIALECT = Dialect()
+
+
+def scan(*datagrams: bytes):
+    data = np.frombuffer(b"".join(datagrams), np.uint8)
+    bounds = np.cumsum([0] + [len(d) for d in datagrams])
+    t_rx = 1_000_000 * np.arange(1, len(datagrams) + 1)
+    return scan_datagrams(data, bounds, t_rx, np.zeros(len(datagrams), np.uint8), DIALECT.crc_extra)
+
+
+def read(log: bytes, cuts: list[int] | None = None, links: int = 1):
+    scanner = TlogScanner(DIALECT.crc_extra, links)
+    edges = [0, *sorted(cuts or []), len(log)]
+    return [
+        scanner.scan(log[a:b], final=b == len(log) and i == len(edges) - 2) for i, (a, b) in enumerate(pairwise(edges))
+    ]
+
+
+def account(batches) -> int:
+    """Bytes in frames, headers, discarded and, at the end, pending."""
+    return sum(int(b.length.sum()) + b.headers + b.discarded for b in batches) + batches[-1].pending
+
+
+def frames_of(batches) -> list[tuple[int, bytes]]:
+    return [(int(b.t_rx[i]) // 1000, b.frame(i)) for b in batches for i in range(len(b))]
+
+
+def junk_of(batches) -> bytes:
+    return b"".join(b.junk(i) for b in batches for i in range(len(b.junk_start)))
+
+
+def test_both_versions_and_their_headers():
+    one, two = Sender(3, 7, seq=200, version=1).attitude(5), Sender(4, 8, seq=255).attitude(6)
+    found = scan(one + two)
+    assert found.frame(0) == one
+    assert found.frame(1) == two
+    assert found.sysid.tolist() == [3, 4]
+    assert found.compid.tolist() == [7, 8]
+    assert found.seq.tolist() == [200, 255]
+    assert found.msgid.tolist() == [30, 30]
+    assert (one[0], two[0]) == (STX1, STX2)
+
+
+@pytest.mark.parametrize("position", [1, 10, 20])
+def test_a_corrupt_frame_is_counted_and_kept_and_its_neighbours_survive(position):
+    sender = Sender()
+    good = [sender.attitude(i) for i in range(3)]
+    bad = bytearray(good[1])
+    bad[position] ^= 0x40
+    found = scan(good[0] + bytes(bad) + good[2])
+    assert [found.frame(i) for i in range(len(found))] == [good[0], good[2]]
+    assert found.junk(0) == bytes(bad)
+    assert found.junk_corrupt.tolist() == [True]
+
+
+def test_a_length_byte_that_claims_too_much_does_not_swallow_what_follows():
+    sender = Sender()
+    good = [sender.attitude(i) for i in range(17)]
+    found = scan(b"\xfd\xff\x00" + b"".join(good))
+    assert len(found) == 17
+    assert found.discarded == 3
+
+
+def test_a_datagram_is_not_continued_in_the_next():
+    frame = Sender().attitude(1)
+    found = scan(frame[:20], frame[20:] + frame)
+    assert len(found) == 1
+    assert found.discarded == len(frame)
+    assert found.junk_corrupt.tolist() == [True, False]
+
+
+def test_an_unknown_id_is_a_frame_only_where_framing_on_both_sides_agrees():
+    sender = Sender()
+    found = scan(sender.attitude(1) + sender.unknown() + sender.attitude(2), sender.unknown(), sender.unknown() + b"?")
+    assert found.known.tolist() == [True, False, True, False]
+    assert found.discarded == len(sender.unknown()) + 1
+
+
+def test_flags_from_the_future_are_not_parsed():
+    frame = bytearray(Sender().attitude(1))
+    frame[2] = 2
+    assert len(scan(bytes(frame))) == 0
+
+
+def test_a_signed_frame_is_thirteen_bytes_longer():
+    frame = bytearray(Sender().attitude(1)[:-2])
+    frame[2] = 1
+    crc = fastcrc.crc16.mcrf4xx(bytes(frame[1:]) + bytes([int(DIALECT.crc_extra[30])]), 0xFFFF)
+    signed = bytes(frame) + crc.to_bytes(2, "little") + bytes(13)
+    found = scan(signed + Sender().heartbeat())
+    assert found.length.tolist() == [len(signed), 21]
+    assert found.checksum()[0] == crc
+
+
+def test_noise_holds_no_frames():
+    noise = np.random.default_rng(1).integers(0, 256, 100_000, dtype=np.uint8).tobytes()
+    found = scan(noise)
+    assert len(found) == 0
+    assert found.discarded == len(noise)
+
+
+pieces = st.lists(
+    st.one_of(
+        st.builds(lambda i: ("frame", i), st.integers(0, 2**32 - 1)),
+        st.builds(lambda b: ("noise", b), st.binary(min_size=1, max_size=60)),
+        st.builds(
+            lambda b: ("noise", b), st.sampled_from([b"\xfd", b"\xfe", b"\xfd\xfd\x00", b"\xfe\x09\x00", bytes(9)])
+        ),
+    ),
+    max_size=12,
+)
+
+
+@given(st.lists(pieces, min_size=1, max_size=4))
+@settings(max_examples=200, deadline=None)
+def test_datagrams_frames_plus_discarded_are_the_bytes_in(datagrams):
+    sender = Sender()
+    wires = [b"".join(sender.attitude(x) if kind == "frame" else x for kind, x in d) for d in datagrams]
+    found = scan(*wires)
+    assert int(found.length.sum()) + found.discarded == sum(map(len, wires))
+    assert (found.junk_length > 0).all()
+
+
+@given(pieces, st.lists(st.integers(0, 600), max_size=5), st.integers(0, 40))
+@settings(max_examples=300, deadline=None)
+def test_a_log_reads_the_same_however_it_is_cut(parts, cuts, missing):
+    sender = Sender()
+    log = b"".join(
+        (1_700_000_000_000_000 + i).to_bytes(8, "big") + sender.attitude(x) if kind == "frame" else x
+        for i, (kind, x) in enumerate(parts)
+    )
+    log = log[: len(log) - missing]
+    whole = read(log)
+    pieces_ = read(log, [min(c, len(log)) for c in cuts])
+    assert account(whole) == account(pieces_) == len(log)
+    assert frames_of(pieces_) == frames_of(whole)
+    assert junk_of(pieces_) == junk_of(whole)
+    assert sum(b.junk_corrupt.sum() for b in pieces_) == sum(b.junk_corrupt.sum() for b in whole)
+
+
+@pytest.mark.parametrize("byte", [0xFD, 0xFE])
+def test_a_start_byte_anywhere_in_a_time_changes_nothing(byte):
+    sender = Sender()
+    frames = []
+    for place in range(2, 8):
+        us = int.from_bytes(bytes(byte if i == place else min(i, 6) for i in range(8)), "big")
+        frames.append((us, sender.attitude(place)))
+    assert frames_of(read(tlog(frames))) == frames
+
+
+def test_a_time_that_is_none_does_not_lose_its_frame():
+    frames = [(10**15, Sender().attitude(0)), (2**63 + 5, Sender().attitude(1))]
+    assert [f for _, f in frames_of(read(tlog(frames)))] == [f for _, f in frames]
+    assert [t for t, _ in frames_of(read(tlog(frames)))] == [10**15, 10**15]
+
+
+def test_a_log_cut_inside_its_last_frame_leaves_it_pending():
+    sender = Sender()
+    log = tlog([(1000, sender.attitude(1)), (2000, sender.attitude(2))])
+    found = read(log[:-5])
+    assert len(frames_of(found)) == 1
+    assert found[-1].pending == 8 + len(sender.attitude(3)) - 5
+    assert found[-1].discarded == 0
+
+
+def test_garbage_between_records_is_skipped_and_counted():
+    sender = Sender()
+    a, b = (10**15, sender.attitude(1)), (10**15 + 5, sender.attitude(2))
+    found = read(tlog([a]) + b"garbage \xfd in between" + tlog([b]))
+    assert frames_of(found) == [a, b]
+    assert junk_of(found) == b"garbage \xfd in between"
+
+
+def test_our_own_archive_keeps_what_was_no_frame_with_its_time():
+    sender = Sender()
+    bad = bytearray(sender.attitude(1))
+    bad[12] ^= 1
+    log = write_record(1000, sender.attitude(0)) + write_junk(2000, bytes(bad)) + write_junk(3000, b"x" * 70000)
+    found = join(read(log, [17, 60, 5000]))
+    assert len(found) == 1
+    assert found.junk(0) == bytes(bad)
+    assert found.discarded == len(bad) + 70000
+    assert found.junk_t_rx.tolist() == [2_000_000, 3_000_000, 3_000_000]
+    assert found.junk_corrupt.tolist() == [True, False, False]
+
+
+def test_link_numbers_travel_in_the_two_lowest_bits_when_the_log_says_so():
+    frame = Sender().attitude(1)
+    found = join(read(tlog([(4000, frame), (4007, frame)]), links=2))
+    assert found.link.tolist() == [0, 3]
+    assert found.t_rx.tolist() == [4_000_000, 4_004_000]
+
+
+def test_joined_batches_are_one():
+    sender = Sender()
+    batches = [scan(sender.attitude(i), b"junk") for i in range(3)]
+    whole = join(batches)
+    assert [whole.frame(i) for i in range(3)] == [b.frame(0) for b in batches]
+    assert [whole.junk(i) for i in range(3)] == [b"junk"] * 3
+    assert whole.select(np.array([2])).frame(0) == batches[2].frame(0)
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_a_real_log_is_read_to_its_last_byte(name):
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{path} is not here")
+    log = path.read_bytes()
+    found = read(log, list(range(100_000, len(log), 100_000)))
+    assert account(found) == len(log)
+    assert sum(b.discarded for b in found) == 0
+    assert found[-1].pending == (31 if name.startswith("copter") else 0)
+    counts = {
+        "copter_2015_4reboots.tlog": 163_851,
+        "sitl_quadplane_uavlogviewer_vtol.tlog": 23_894,
+        "plane_2014_aerobatic_50hz.tlog": 74_759,
+        "plane_swiss_137hz.tlog": 27_016,
+    }
+    assert sum(len(b) for b in found) == counts[name]

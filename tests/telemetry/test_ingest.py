@@ -1,0 +1,251 @@
+"""Frames become samples that do not depend on how they were cut into batches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from telemetry.frames import Frames
+from telemetry.ingest import Settings, ingest
+from telemetry.mavlink import Dialect
+from telemetry.messages import (
+    Altitude,
+    ClockFit,
+    Event,
+    Gnss,
+    LinkBytes,
+    LinkStats,
+    Mark,
+    Message,
+    Progress,
+    StatusText,
+)
+from tests.telemetry.test_frames import read, scan
+from tests.telemetry.wire import DATA, LOGS, Sender, tlog
+
+DIALECT = Dialect()
+US = 1_700_000_000_000_000
+
+
+def run(batches: Iterable[Frames], links=("0",)) -> list[Message]:
+    return list(ingest(batches, links, DIALECT))
+
+
+def told(messages: Iterable[Message], kind: type[Message]) -> list[Message]:
+    return [m for m in messages if isinstance(m, kind)]
+
+
+def texts(messages: Iterable[Message]) -> list[str]:
+    return [text for m in told(messages, Event) for text in m.text]
+
+
+def columns(messages: Iterable[Message]) -> dict:
+    """Everything said, per stream, as if it had been said at once."""
+    rows: dict = {}
+    for m in messages:
+        if isinstance(m, Progress | LinkBytes):
+            continue
+        mine = rows.setdefault((type(m).__name__, m.vehicle, m.source, m.boot), {})
+        for name in m.__struct_fields__:
+            value = getattr(m, name)
+            if isinstance(value, np.ndarray):
+                mine.setdefault(name, []).append(value)
+            elif isinstance(value, list):
+                mine.setdefault(name, []).append(np.array(value))
+    whole = {key: {name: np.concatenate(parts) for name, parts in found.items()} for key, found in rows.items()}
+    for key, found in whole.items():
+        if key[0] == "Event":  # of one sender, but about different things: told as they become known
+            order = np.lexsort((found["text"], found["t_rx"]))
+            whole[key] = {name: column[order] for name, column in found.items()}
+    return whole
+
+
+def assert_same(a: dict, b: dict) -> None:
+    assert a.keys() == b.keys()
+    for key, found in a.items():
+        for name, column in found.items():
+            np.testing.assert_array_equal(column, b[key][name], err_msg=f"{key} {name}")
+
+
+def flight(seconds: int = 20, boot_ms: int = 5000, reboot_at: int | None = None) -> list[tuple[int, bytes]]:
+    """A vehicle at 4 Hz, rebooted once after 10 s of silence if asked for."""
+    sender, frames, us, ms = Sender(), [], US, boot_ms
+    for second in range(seconds):
+        if second == reboot_at:
+            sender, us, ms = Sender(), us + 10_000_000, 3000
+        frames += [(us, sender.heartbeat()), (us + 1, sender.system_time(US, ms))]
+        for quarter in range(4):
+            t = ms + 250 * quarter
+            frames += [
+                (us + 250_000 * quarter + 10, sender.pressure(t, 900 + 0.01 * second)),
+                (us + 250_000 * quarter + 20, sender.gps(t - 50, 47.0, 8.0, 500 + second)),
+                (us + 250_000 * quarter + 30, sender.attitude(t)),
+            ]
+        us, ms = us + 1_000_000, ms + 1000
+    return frames
+
+
+def test_the_vehicle_clock_is_anchored_at_its_first_timed_frame():
+    frames = flight(3)
+    found = told(run(read(tlog(frames))), Altitude)[0]
+    first_timed = (US + 1) * 1000
+    assert found.t[0] == first_timed
+    assert np.diff(found.t).tolist() == [250_000_000] * 11, "the vehicle's own intervals"
+    assert found.t_rx[0] == (US + 10) * 1000
+
+
+def test_a_fix_has_the_time_of_the_fix():
+    fixes = told(run(read(tlog(flight(3)))), Gnss)[0]
+    pressure = told(run(read(tlog(flight(3)))), Altitude)[0]
+    assert (pressure.t - fixes.t == 50_000_000).all()
+
+
+def test_a_reboot_begins_a_new_epoch():
+    messages = run(read(tlog(flight(30, reboot_at=15))))
+    assert [m.boot for m in told(messages, Altitude)] == [0, 1]
+    assert any("rebooted: boot clock" in text for text in texts(messages))
+    stats = told(messages, LinkStats)
+    assert stats[-1].restarted[-1] == 1
+    assert stats[-1].lost[-1] == 0, "the jump of a restart is no loss"
+
+
+@given(st.lists(st.integers(0, 15_000), max_size=8))
+@settings(max_examples=25, deadline=None)
+def test_batches_do_not_change_what_is_said(cuts):
+    log = tlog(flight(30, reboot_at=15))
+    whole = columns(run(read(log)))
+    assert_same(columns(run(read(log, [min(cut, len(log)) for cut in cuts]))), whole)
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_batches_do_not_change_what_a_real_log_says(name):
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{path} is not here")
+    log = path.read_bytes()
+    random = np.random.default_rng(3)
+    cuts = random.integers(0, len(log), 40).tolist()
+    assert_same(columns(run(read(log, cuts))), columns(run(read(log))))
+
+
+def test_progress_covers_all_that_was_told_and_ends():
+    messages = run(read(tlog(flight(30, reboot_at=15)), list(range(200, 12_000, 500))))
+    until = 0
+    pending: list[int] = []
+    for message in messages:
+        if isinstance(message, Progress):
+            assert message.t_rx[-1] >= until
+            until = int(message.t_rx[-1])
+        elif isinstance(message, Altitude):
+            assert message.t_rx[0] > until, "nothing is told after its time has been covered"
+            pending += message.t_rx.tolist()
+    assert message.final
+    assert until >= max(pending)
+
+
+def test_a_vehicle_whose_clock_is_in_doubt_holds_nobody_else_up():
+    a, b = Sender(1), Sender(2)
+    log = [
+        (US + i * 100_000, s.pressure(ms, 900)) for i in range(100) for s, ms in ((a, 100_000 + 100 * i), (b, 100 * i))
+    ]
+    log += [(US + 10_100_000, a.pressure(1000, 900)), (US + 10_200_000, b.pressure(10_100, 900))]
+    messages = list(ingest(read(tlog(log)), ["0"], DIALECT))
+    assert sum(len(m.t) for m in told(messages, Altitude) if m.vehicle == 2) == 101
+    assert sum(len(m.t) for m in told(messages, Altitude) if m.vehicle == 1) == 101
+
+
+def test_messages_without_a_time_take_that_of_their_neighbours():
+    sender = Sender()
+    log = [(US, sender.attitude(1000)), (US + 5, sender.text("TP 1 start")), (US + 9, sender.attitude(2000))]
+    messages = run(read(tlog(log)))
+    assert told(messages, Mark)[0].t[0] == US * 1000
+    assert told(messages, StatusText)[0].text == ["TP 1 start"]
+
+
+def test_another_component_has_its_own_clock_and_does_not_upset_the_autopilots():
+    pilot, gimbal = Sender(1, 1), Sender(1, 154)
+    log = [
+        (US + i * 100_000, f)
+        for i in range(50)
+        for f in (gimbal.attitude(9_000_000 + i), pilot.pressure(1000 + 100 * i, 900))
+    ]
+    messages = run(read(tlog(log)))
+    assert not any(
+        "clock" in text or "reboot" in text for text in texts(messages) if "stepped back" in text and "90" not in text
+    )
+    found = told(messages, Altitude)
+    assert sum(len(m.t) for m in found) == 50
+    assert {m.boot for m in found} == {0}
+
+
+def test_a_receive_clock_that_steps_back_is_told_and_time_runs_on():
+    log = flight(10)
+    later = [(us - 3_600_000_000, frame) for us, frame in flight(10, boot_ms=15_000)]
+    messages = run(read(tlog(log + later)))
+    assert any("the receive clock stepped back by" in text for text in texts(messages))
+    t_rx = np.concatenate([m.t_rx for m in told(messages, Altitude)])
+    assert (np.diff(t_rx) > 0).all()
+
+
+def test_every_byte_is_in_the_account_and_damage_is_told():
+    log = tlog(flight(5)[:-3]) + b"rubbish" + tlog(flight(5)[-3:])
+    messages = run(read(log[:-4]))
+    account = told(messages, LinkBytes)[-1]
+    frames = account.frames[-1]
+    assert account.discarded[-1] == 7
+    assert account.pending[-1] > 0
+    assert account.bytes[-1] + 8 * frames == len(log) - 4
+    assert "link 0: 7 bytes were no frame, 0 frames were corrupt" in texts(messages)
+    assert any("the log ends inside a record" in text for text in texts(messages))
+
+
+def test_a_frame_of_an_unknown_id_fills_its_number_and_is_counted():
+    sender = Sender()
+    messages = run([scan(sender.attitude(1), sender.unknown(), sender.attitude(2))])
+    assert told(messages, LinkBytes)[-1].unknown[-1] == 1
+    assert told(messages, LinkStats)[-1].received[-1] == 3
+    assert told(messages, LinkStats)[-1].lost[-1] == 0
+
+
+def test_who_speaks_is_told_once():
+    said = texts(run(read(tlog(flight(5)))))
+    assert (
+        said.count("system 1 component 1: quadrotor, autopilot ardupilotmega")
+        + said.count("system 1 component 1: fixed wing, autopilot ardupilotmega")
+        == 1
+    )
+
+
+def test_the_pattern_of_marks_is_a_setting():
+    sender = Sender()
+    log = tlog([(US, sender.attitude(1000)), (US + 5, sender.text("POINT 3 stop"))])
+    settings_ = Settings(mark=r"POINT (?P<name>\d+) (?P<action>start|stop)")
+    marks = told(ingest(read(log), ["0"], DIALECT, settings_), Mark)
+    assert (marks[0].name, marks[0].action) == (["3"], ["stop"])
+
+
+def test_nothing_in_nothing_out_but_the_end():
+    messages = run([])
+    assert told(messages, Progress)[-1].final
+
+
+@pytest.mark.parametrize(
+    ("name", "boots", "words"),
+    [
+        ("copter_2015_4reboots.tlog", 5, "rebooted"),
+        ("sitl_quadplane_uavlogviewer_vtol.tlog", 1, "stepped back without a reboot"),
+    ],
+)
+def test_boots_of_the_real_logs(name, boots, words):
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{path} is not here")
+    messages = run(read(path.read_bytes()))
+    assert {m.boot for m in told(messages, Gnss)} == set(range(boots))
+    assert any(words in text for text in texts(messages))
+    fits = told(messages, ClockFit)
+    assert {reference for m in fits for reference in m.reference} == {"arrival", "system_time"}
