@@ -1,0 +1,152 @@
+"""One door: any linear system in, `Smoothed` out, and everything that does not fit named with its step."""
+
+import numpy as np
+import pytest
+
+from estimator import LinearModel, Smoothed, smooth
+from tests.estimator.oracle import batch, in_sigmas, problem, relative
+
+N, P, M = 4, 2, 3
+GOOD = {"phi": np.eye(N), "gamma": np.ones((N, P)), "q": np.ones(P), "h": np.ones((M, N)), "r": np.ones(M)}
+
+
+def model(**changes):
+    return LinearModel(**{**GOOD, **changes})
+
+
+def bad(shape, at, value):
+    array = np.ones(shape)
+    array[at] = value
+    return array
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"phi": np.eye(3)}, r"h has shape \(3, 4\) per step, \(3, 3\) is needed|gamma has shape"),
+        ({"phi": np.ones((2, 3))}, r"phi has shape \(2, 3\) per step, \(3, 3\) is needed"),
+        ({"phi": np.ones(4)}, r"phi has shape \(4,\), \(n, n\) or \(N, n, n\) is needed"),
+        ({"gamma": np.ones((3, P))}, r"gamma has shape \(3, 2\) per step, \(4, 2\) is needed"),
+        ({"h": np.ones((M, 5))}, r"h has shape \(3, 5\) per step, \(3, 4\) is needed"),
+        ({"q": np.ones(3)}, r"q has shape \(3,\)"),
+        ({"q": np.ones((7, 3))}, r"q has shape \(7, 3\)"),
+        ({"r": np.ones((2, 2))}, r"r has shape \(2, 2\)"),
+        ({"r": "loud"}, "r is not an array of numbers"),
+        ({"phi": np.ones((5, N, N)), "q": np.ones((6, P))}, "q is given for 6 steps, others for 5"),
+        ({"phi": bad((5, N, N), (3, 0, 0), np.nan)}, "phi is not finite at step 3"),
+        ({"gamma": bad((5, N, P), (2, 0, 0), np.inf)}, "gamma is not finite at step 2"),
+        ({"h": bad((M, N), (0, 0), np.nan)}, "h is not finite at step 0"),
+        ({"q": bad((7, P), (4, 1), -1.0)}, "q is negative at step 4"),
+        ({"q": bad((7, P), (4, 1), np.nan)}, "q is not finite at step 4"),
+        ({"r": bad((7, M), (6, 1), 0.0)}, "r is not positive at step 6"),
+        ({"r": bad((7, M), (6, 1), -np.inf)}, "r is not finite at step 6"),
+        (
+            {"q": np.stack([np.eye(P), [[1.0, 2.0], [2.0, 1.0]]])},
+            r"q is not symmetric and positive semidef.* at step 1",
+        ),
+        ({"q": [[1.0, 0.3], [0.2, 1.0]]}, "q is not symmetric"),
+        ({"q": [[1.0, 0.3], [0.3, 0.0]]}, "q is not symmetric and positive semidefinite at step 0"),
+        ({"r": np.stack([np.eye(M), np.ones((M, M))])}, "r is not symmetric and positive definite at step 1"),
+        ({"r": np.diag([1.0, 0.0, 1.0])}, "r is not symmetric and positive definite at step 0"),
+    ],
+)
+def test_a_model_that_cannot_be_is_refused_by_argument_and_step(changes, message):
+    with pytest.raises(ValueError, match=message):
+        model(**changes)
+
+
+def test_shapes_and_steps():
+    assert model().steps is None and repr(model()) == "LinearModel(n=4, p=2, m=3, constant)"
+    varying = model(phi=np.broadcast_to(np.eye(N), (5, N, N)))
+    assert varying.steps == 5 and "5 steps" in repr(varying)
+    assert model(q=np.ones((9, P))).steps == 9
+    assert model(r=np.ones((9, M))).steps == 9
+    assert varying.cut(1, 3).steps == 2 and varying.cut(1, 3).q.shape == (1, P)
+    with pytest.raises(IndexError, match=r"steps 3\.\.6 of a model of 5 steps"):
+        varying.cut(3, 6)
+
+
+def test_read_only_and_strided_arrays_are_fine():
+    phi = np.asfortranarray(np.eye(N) + 0.1)
+    phi.flags.writeable = False
+    smooth(model(phi=phi), np.ones((5, 2 * M))[:, ::2], x0=np.zeros(N), p0=np.eye(N))
+
+
+def test_a_square_q_is_a_covariance_unless_it_can_only_be_rows():
+    q = np.array([[2.0, 1.0], [1.0, 2.0]])
+    per_step = {"phi": np.broadcast_to(np.eye(N), (P, N, N))}
+    more = {"phi": np.broadcast_to(np.eye(N), (P + 1, N, N))}
+    for same in (model(q=q), model(q=q[None]), model(q=q, **more), model(q=q[None], **per_step)):
+        assert np.allclose(same.gamma[0] @ np.diag(same.q[0]) @ same.gamma[0].T, GOOD["gamma"] @ q @ GOOD["gamma"].T)
+    for rows in (np.array([[1.0, 2.0], [1.0, 2.0]]), np.ones((P, P))):
+        assert np.array_equal(model(q=rows, **per_step).q, rows)
+        assert np.array_equal(model(q=rows, **per_step).gamma[0], GOOD["gamma"])
+    for either in (q, np.diag([1.0, 2.0])):
+        with pytest.raises(ValueError, match=r"q has shape \(2, 2\) beside 2 steps: one covariance is written \(1"):
+            model(q=either, **per_step)
+
+
+def test_a_singular_covariance_of_process_noise_is_absorbed():
+    q = np.outer([1.0, 2.0], [1.0, 2.0])
+    absorbed = model(q=q)
+    gamma = absorbed.gamma[0]
+    assert np.allclose(gamma @ np.diag(absorbed.q[0]) @ gamma.T, np.ones((N, P)) @ q @ np.ones((P, N)))
+
+
+@pytest.mark.parametrize("method", ["ms", "rts"])
+def test_constant_matrices_are_the_same_as_repeated_ones(method):
+    rng = np.random.default_rng(0)
+    phi, gamma, h = 0.5 * rng.normal(size=(4, 4)), rng.normal(size=(4, 2)), rng.normal(size=(3, 4))
+    q, r = np.array([[2.0, 1.0], [1.0, 3.0]]), np.eye(3) + 0.3
+    z, prior = rng.normal(size=(10, 3)), {"x0": np.zeros(4), "p0": np.eye(4), "method": method}
+    constant = smooth(LinearModel(phi, gamma, q, h, r), z, **prior)
+    repeated = smooth(LinearModel(*(np.repeat(a[None], 10, axis=0) for a in (phi, gamma, q, h, r))), z, **prior)
+    for a, b in zip(constant, repeated, strict=True):
+        assert np.array_equal(a, b, equal_nan=True)
+
+
+def test_the_fields_of_smoothed():
+    case = problem(1, 4, 2, 2, 30, missing=0.2)
+    smoothed = smooth(case.model, case.z, **case.prior, window=10)
+    assert isinstance(smoothed, Smoothed) and smoothed.windows == [0, 10, 20]
+    for field in (smoothed.mean, smoothed.std, smoothed.filtered_mean, smoothed.filtered_std):
+        assert field.shape == (31, 4)
+    assert smoothed.covariance.shape == (31, 4, 4) and smoothed.bytes_per_step == 8 * (16 + 16 + 4)
+    assert np.array_equal(smoothed.filtered_mean[0], case.x0)
+    assert np.allclose(smoothed.filtered_std[0], np.sqrt(np.diag(case.p0)))
+    assert np.allclose(smoothed.filtered_mean[-1], smoothed.mean[-1])
+
+
+def test_without_prior_row_0_of_the_filter_is_empty():
+    case = problem(2, prior=False)
+    smoothed = smooth(case.model, case.z)
+    assert np.isnan(smoothed.filtered_mean[0]).all() and np.isinf(smoothed.filtered_std[0]).all()
+    mean, covariance = batch(case)
+    std = np.sqrt(np.einsum("jii->ji", covariance))
+    assert in_sigmas(smoothed.mean, mean, std) < 1e-9 and relative(smoothed.std, std) < 1e-9
+
+
+def test_an_explicit_window_is_still_closed_by_condition():
+    # Unwindowed, 60 steps of these modes have a condition number of 1e36 and nothing would be left of the answer.
+    case = problem(3, 3, 2, 2, 60, growth=2.0)
+    smoothed = smooth(case.model, case.z, **case.prior, window=1000)
+    by_one = smooth(case.model, case.z, **case.prior, window=1)
+    assert len(smoothed.windows) > 5 and relative(smoothed.std, by_one.std) < 1e-10
+
+
+def test_no_steps_give_the_prior():
+    smoothed = smooth(model(), np.empty((0, M)), x0=np.arange(4.0), p0=np.ones(4))
+    assert np.array_equal(smoothed.mean, [np.arange(4.0)]) and smoothed.windows == []
+
+
+def test_an_unknown_method_is_refused_by_name():
+    with pytest.raises(ValueError, match="method 'magic' is unknown: choose from ms, rts"):
+        smooth(model(), np.ones((2, M)), method="magic")
+
+
+def test_a_singular_phi_is_refused_by_the_method_that_inverts_it():
+    phi = np.repeat(np.eye(N)[None], 6, axis=0)
+    phi[4, 3, 3] = 0.0
+    singular, prior = model(phi=phi), {"x0": np.zeros(N), "p0": np.eye(N)}
+    with pytest.raises(ValueError, match=r"phi is singular at step 4: .* method 'rts' does not"):
+        smooth(singular, np.ones((6, M)), **prior)

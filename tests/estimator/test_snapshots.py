@@ -1,0 +1,97 @@
+"""The store keeps what Table 5 counts, grows without copying much, and forgets on request."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimator import Rule, Store
+from estimator.information import anchor, filter, start
+from estimator.smoother import backward
+from tests.estimator.oracle import problem
+
+
+def filled(steps=40, seed=1, length=7):
+    case = problem(seed, 4, 2, 2, steps, missing=0.2)
+    store = Store()
+    carry, _ = filter(case.model, start(4, **case.prior), case.z, rule=Rule(steps=length), store=store)
+    return case, store, carry
+
+
+def test_bytes_per_step_are_those_of_table_5():
+    _, store, _ = filled()
+    n, p = 4, 2
+    assert store.bytes_per_step == 8 * (n * n + 2 * n * p + 2 * p)
+    assert sum(field.nbytes for field in store.steps) == len(store) * store.bytes_per_step + 8 * n * n
+    assert Store().bytes_per_step == 0
+
+
+def test_windows_begin_where_they_should_and_say_why():
+    _, store, carry = filled(40, length=7)
+    assert len(store) == 40 and store.anchors == [0, 7, 14, 21, 28, 35]
+    assert store.reasons == ["start"] + ["length"] * 5 and carry.steps == 5
+    _, store, carry = filled(14, length=7)
+    assert store.anchors == [0, 7, 14] and carry.steps == 0
+    assert "14 steps" in repr(store)
+
+
+@given(st.lists(st.tuples(st.integers(0, 30), st.floats(0.0, 1.0)), min_size=1, max_size=12))
+@settings(max_examples=40, deadline=None)
+def test_dropping_never_changes_what_is_left(parts):
+    total = sum(count for count, _ in parts)
+    case = problem(2, 3, 1, 1, total)
+    model, rule = case.model, Rule(steps=9)
+    store, all_kept = Store(), Store()
+    carry = start(3, **case.prior)
+    at = 0
+    for count, share in parts:
+        chunk, z = model.cut(at, at + count), case.z[at : at + count]
+        filter(chunk, carry, z, rule=rule, store=all_kept)
+        carry, _ = filter(chunk, carry, z, rule=rule, store=store)
+        at += count
+        store.drop(int(share * len(store)))
+        gone = store.dropped
+        assert gone + len(store) == at
+        mean, covariance = backward(store, carry)
+        full_mean, full_covariance = backward(all_kept, carry, first=gone)
+        assert np.array_equal(mean, full_mean) and np.array_equal(covariance, full_covariance)
+        assert store.anchors == [i - gone for i in all_kept.anchors if i >= gone]
+
+
+def test_memory_is_bounded_by_what_is_held():
+    case = problem(3, 4, 2, 2, 10)
+    store, carry = Store(), start(4, **case.prior)
+    for _ in range(400):
+        carry, _ = filter(case.model, carry, case.z, store=store)
+        store.drop(max(0, len(store) - 100))
+    assert len(store) == 100 and store.dropped == 3900
+    assert store.steps.phi.base.shape[0] <= 512
+
+
+def test_a_mark_in_the_middle_is_a_window():
+    case = problem(4, 4, 2, 2, 30)
+    model, store = case.model, Store()
+    carry, _ = filter(model.cut(0, 11), start(4, **case.prior), case.z[:11], store=store)
+    carry, _ = filter(model.cut(11, 30), anchor(carry), case.z[11:], store=store)
+    assert store.anchors == [0, 11] and store.reasons == ["start", "start"]
+
+
+def test_a_fresh_store_may_begin_inside_a_window():
+    case = problem(5, 4, 2, 2, 30)
+    model, whole, late = case.model, Store(), Store()
+    carry, _ = filter(model.cut(0, 11), start(4, **case.prior), case.z[:11], store=whole)
+    filter(model.cut(11, 30), carry, case.z[11:], store=late)
+    carry, _ = filter(model.cut(11, 30), carry, case.z[11:], store=whole)
+    assert np.array_equal(backward(late, carry)[0], backward(whole, carry, first=11)[0])
+
+
+def test_steps_that_do_not_follow_are_refused():
+    case, store, carry = filled()
+    other, _ = filter(case.model.cut(0, 9), start(4), case.z[:9])
+    with pytest.raises(ValueError, match="carry is not the one that the newest step"):
+        filter(case.model, other, case.z, store=store)
+    wide = problem(1, 4, 3, 2, 5)
+    with pytest.raises(ValueError, match="store holds 4 states and 2 noise components, the model has 4 and 3"):
+        filter(wide.model, carry, wide.z, store=store)
+    with pytest.raises(IndexError, match="the store holds 40 steps"):
+        store.drop(41)

@@ -1,0 +1,128 @@
+"""The U-D kernels do what the dense formulas say, and keep doing it where the dense formulas fail."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimator import ud
+
+seeds = st.integers(0, 2**32 - 1)
+sizes = st.integers(1, 9)
+
+
+def factors(rng, n, spread=1.0):
+    """U^T (unit lower triangular) and D > 0."""
+    return np.tril(rng.normal(size=(n, n)), -1) + np.eye(n), np.exp(spread * rng.normal(size=n))
+
+
+def dense(ut, d):
+    return ut.T @ np.diag(d) @ ut
+
+
+def is_unit_triangular(ut):
+    return np.array_equal(np.triu(ut), np.eye(len(ut)))
+
+
+@given(seeds, sizes)
+@settings(max_examples=40, deadline=None)
+def test_bierman_subtracts_what_a_scalar_tells(seed, n):
+    rng = np.random.default_rng(seed)
+    ut, d = factors(rng, n)
+    before, h, r, k = dense(ut, d), rng.normal(size=n), rng.uniform(0.1, 2.0), np.empty(n)
+    s = ud.bierman(ut, d, h, r, k)
+    assert np.isclose(s, r + h @ before @ h, rtol=1e-12)
+    assert np.allclose(k, before @ h, rtol=1e-11, atol=1e-11 * np.abs(before).max())
+    ph = before @ h
+    assert np.allclose(dense(ut, d), before - np.outer(ph, ph) / s, atol=1e-11 * np.abs(before).max())
+    assert is_unit_triangular(ut) and (d > 0.0).all()
+
+
+@given(seeds, sizes, st.sampled_from([0.0, 1e-9, 1.0, 1e9]), st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_agee_turner_adds_a_square(seed, n, c, empty):
+    rng = np.random.default_rng(seed)
+    ut, d = factors(rng, n)
+    if empty:
+        d[rng.random(n) < 0.5] = 0.0
+    before, a, first = dense(ut, d), rng.normal(size=n), d[0]
+    added = ud.agee_turner(ut, d, a.copy(), c)
+    expected = before + c * np.outer(a, a)
+    assert np.allclose(dense(ut, d), expected, atol=1e-12 * np.abs(expected).max())
+    assert is_unit_triangular(ut) and (d >= 0.0).all()
+    assert d[0] == first + added
+
+
+def test_agee_turner_keeps_the_small_pivot_under_a_dominating_datum():
+    # Without the composite branch U_01 = u + beta (a_0 - s u) cancels, and with it the digits of what was there before.
+    u, d, a, c = 0.3, [1.0, 1e-18], [0.7, 1.1], 1.0
+    exact_u, exact_d = [Fraction(u)], [Fraction(x) for x in d]
+    s = Fraction(a[1])
+    dn = exact_d[1] + Fraction(c) * s * s
+    expected = (exact_d[1] * exact_u[0] + Fraction(c) * s * Fraction(a[0])) / dn
+    rest = Fraction(c) * exact_d[1] / dn * (Fraction(a[0]) - s * exact_u[0]) ** 2
+    ut, pivots = np.array([[1.0, 0.0], [u, 1.0]]), np.array(d)
+    added = ud.agee_turner(ut, pivots, np.array(a), c)
+    assert ut[1, 0] == pytest.approx(float(expected), rel=1e-15)
+    assert added == pytest.approx(float(rest), rel=1e-14)
+
+
+def test_information_from_nothing_is_exact():
+    rng = np.random.default_rng(1)
+    n = 6
+    ut, d, rows = np.eye(n), np.zeros(n), rng.normal(size=(n, n))
+    for row in rows:
+        ud.agee_turner(ut, d, row.copy(), 1.0)
+    assert np.allclose(dense(ut, d), rows.T @ rows, rtol=1e-12, atol=1e-12)
+
+
+@given(seeds, sizes, st.integers(0, 5))
+@settings(max_examples=40, deadline=None)
+def test_mwgs_factors_a_weighted_square(seed, n, more):
+    rng = np.random.default_rng(seed)
+    w, weight = rng.normal(size=(n, n + more)), np.exp(rng.normal(size=n + more))
+    expected, ut, d = w @ np.diag(weight) @ w.T, np.empty((n, n)), np.empty(n)
+    ud.mwgs(w.copy(), weight, ut, d)
+    assert np.allclose(dense(ut, d), expected, atol=1e-12 * np.abs(expected).max())
+    assert is_unit_triangular(ut) and (d > 0.0).all()
+
+
+def test_mwgs_gives_a_zero_pivot_a_zero_column():
+    ut, d = np.empty((2, 2)), np.empty(2)
+    ud.mwgs(np.array([[1.0, 2.0], [0.0, 0.0]]), np.ones(2), ut, d)
+    assert np.array_equal(d, [5.0, 0.0]) and np.array_equal(ut, np.eye(2))
+
+
+@given(seeds, sizes, st.integers(1, 4))
+@settings(max_examples=40, deadline=None)
+def test_solves_undo_multiplications(seed, n, count):
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(n, n)) + 3.0 * np.eye(n)
+    a[rng.random((n, n)) < 0.3] = 0.0
+    if abs(np.linalg.det(a)) < 1e-3:
+        return
+    lu, order, x = np.empty((n, n)), np.empty(n, np.int64), np.empty((n, count))
+    assert not ud.factor(a, lu, order)
+    b, out = rng.normal(size=(n, count)), np.empty((n, count))
+    ud.solve(lu, order, b, x)
+    ud.multiply(a, x, out)
+    assert np.allclose(out, b, atol=1e-9) and np.allclose(a @ x, b, atol=1e-9)
+    y = np.empty(n)
+    ud.solve_transposed(lu, order, b[:, 0].copy(), y)
+    assert np.allclose(a.T @ y, b[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "singular"),
+    [
+        ([[1.0, 2.0], [2.0, 4.0]], True),
+        ([[0.0, 1.0], [0.0, 1.0]], True),
+        ([[1e-10, 0.0], [0.0, 1e10]], False),  # units, not singularity
+        ([[0.0, 1.0], [1.0, 0.0]], False),
+    ],
+)
+def test_factor_knows_a_singular_matrix(matrix, singular):
+    lu, order = np.empty((2, 2)), np.empty(2, np.int64)
+    assert ud.factor(np.array(matrix), lu, order) is singular
