@@ -1,0 +1,502 @@
+"""The front door: one command line over the four rooms.
+
+Nothing heavy is imported before a command needs it, so that ``sortie --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import App, CycloptsError, Parameter
+
+from wiring import (
+    DISTRIBUTION,
+    Failure,
+    configure,
+    counted,
+    follow,
+    new_folder,
+    open_log,
+    record_folder,
+    say,
+    smooth_log,
+    stop_on_signals,
+    watch,
+    write_what_runs,
+)
+
+if TYPE_CHECKING:
+    from telemetry.messages import Message
+
+BUS = "tcp/127.0.0.1:7447"
+DEMO_FAULTS = "loss=0.005,outage=100:6"
+DEMO_SPEED = 8.0
+
+app = App(
+    name="sortie",
+    help="Turn the telemetry of a test flight into a trustworthy flight path while the aircraft still flies.",
+    help_format="plaintext",
+    version=lambda: version(DISTRIBUTION),
+)
+bench = App(name="bench", help="Measure speed.", help_format="plaintext")
+app.command(bench)
+
+
+@app.command
+def live(
+    *endpoint: str,
+    sortie: str | None = None,
+    folder: Path | None = None,
+    config: Path | None = None,
+    idle: float | None = None,
+) -> None:
+    """Follow a flight: archive, estimate, smooth and record what arrives, until Ctrl-C.
+
+    Leaves a sortie folder: raw.tlog (the evidence), live.rrd and its layer windows.rrd, report.json, sortie.toml.
+
+    Parameters
+    ----------
+    endpoint
+        Where telemetry comes from: udpin:HOST:PORT listens, udpout:HOST:PORT calls.
+    sortie
+        Name of the sortie; its start time if not given.
+    folder
+        Where to write; sorties/NAME if not given.
+    config
+        TOML file with settings.
+    idle
+        Stop by itself after so many seconds without telemetry.
+    """
+    if not endpoint:
+        raise Failure("say where telemetry comes from, e.g. sortie live udpin:127.0.0.1:14550")
+    name, folder = new_folder(sortie, folder)
+    configuration = configure(config)
+    summary = follow(
+        endpoint,
+        name,
+        folder,
+        configuration,
+        idle,
+        lambda: say(f"{name}: listening on {', '.join(endpoint)}; writing to {folder}; Ctrl-C ends"),
+        say,
+    )
+    say(f"{folder}: {summary.completeness}; look at it with: sortie review {folder}")
+    if not summary.vehicles:
+        raise Failure(f"nothing was received on {', '.join(endpoint)}")
+
+
+@app.command
+def ingest(
+    *endpoint: str, sortie: str, folder: Path, listen: str = BUS, config: Path | None = None, idle: float | None = None
+) -> None:
+    """The first of three processes: receive, archive and publish samples; carries the bus.
+
+    Parameters
+    ----------
+    endpoint
+        Where telemetry comes from.
+    sortie
+        Name of the sortie, the same in all three.
+    folder
+        Where raw.tlog goes.
+    listen
+        Endpoint of the bus for the other processes.
+    config
+        TOML file with settings.
+    idle
+        Stop by itself after so many seconds without telemetry.
+    """
+    import telemetry.ingest
+    from telemetry.archive import RawLog
+    from telemetry.bus import Bus, publish
+    from telemetry.mavlink import Dialect
+    from telemetry.sources.udp import UdpSource
+
+    if not endpoint:
+        raise Failure("say where telemetry comes from, e.g. sortie ingest udpin:127.0.0.1:14550 --sortie S --folder F")
+    configuration = configure(config)
+    name, folder = new_folder(sortie, folder, shared=True)
+    dialect = Dialect(configuration.ingest.dialect)
+    telemetry.ingest.warm_up(dialect)
+    with Bus(name, listen=[listen]) as bus:
+        raw_log = RawLog(folder / "raw.tlog", links=len(endpoint))
+        source = UdpSource(endpoint, dialect, raw_log)
+        write_what_runs(folder, name, endpoint, configuration, dialect)
+        stop_on_signals(source.stop)
+        say(f"{name}: listening on {', '.join(endpoint)}, bus on {listen}")
+        messages = telemetry.ingest.ingest(source.batches(idle), source.links, dialect, configuration.ingest)
+        if not publish(bus, "ingest", watch(messages, say)):
+            raise Failure("a consumer on the bus had not processed everything in time; the raw log is whole")
+
+
+@app.command
+def estimate(*, sortie: str, connect: str = BUS, config: Path | None = None) -> None:
+    """The second of three processes: samples to estimates and windows.
+
+    Parameters
+    ----------
+    sortie
+        Name of the sortie.
+    connect
+        Endpoint of the bus.
+    config
+        TOML file with settings.
+    """
+    from functools import partial
+
+    import estimator.stage
+    from telemetry.bus import Bus, serve
+
+    configuration = configure(config)
+    estimator.stage.warm_up()
+    with Bus(sortie, connect=[connect]) as bus:
+        say(f"{sortie}: estimating on {connect}")
+        serve(bus, "estimate", ["ingest"], partial(estimator.stage.estimate, settings=configuration.estimate))
+
+
+@app.command
+def record(folder: Path, *, sortie: str, connect: str = BUS) -> None:
+    """The third of three processes: write the recording.
+
+    Parameters
+    ----------
+    folder
+        Where live.rrd, windows.rrd and report.json go.
+    sortie
+        Name of the sortie.
+    connect
+        Endpoint of the bus.
+    """
+    from telemetry.bus import Bus
+
+    name, folder = new_folder(sortie, folder, shared=True)
+    with Bus(name, connect=[connect]) as bus:
+        subscription = bus.subscribe("record", ["ingest", "estimate"])
+        say(f"{name}: recording from {connect} into {folder}")
+        stop_on_signals(subscription.stop)
+        record_folder(watch((m for m in subscription if m is not None), say), folder, name, {"bus": connect})
+        subscription.close()
+
+
+@app.command
+def smooth(
+    log: Path,
+    *,
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
+    config: Path | None = None,
+    quiet: bool = False,
+) -> None:
+    """Smooth a log, each boot as a whole, into one recording.
+
+    Parameters
+    ----------
+    log
+        A .tlog file, or a sortie folder.
+    output
+        The recording to write; NAME.rrd in this folder if not given.
+    config
+        TOML file with settings.
+    quiet
+        Say nothing but the result.
+    """
+    configuration = configure(config) if config else None
+    output = output or Path(log.resolve().name).with_suffix(".rrd")
+    summary = smooth_log(log, output, configuration, None if quiet else say)
+    print(
+        f"{output}: {counted(len(summary.vehicles), 'vehicle')}, {counted(len(summary.windows), 'window')}, "
+        f"{summary.completeness}"
+    )
+    if not summary.windows:
+        raise Failure(f"{log}: no satellite fix, so there is nothing to smooth; what could be read is in {output}")
+
+
+@app.command
+def review(recording: Path, *, json: bool = False, plot: Path | None = None) -> None:
+    """Read a recording or a sortie folder back: what flew, what was lost, each window and why it closed.
+
+    Parameters
+    ----------
+    recording
+        An .rrd file or a sortie folder.
+    json
+        Print JSON instead of tables.
+    plot
+        Also draw a picture of it, a PNG.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from viewer.report import tell
+    from viewer.review import review as read_back
+
+    found = read_back(recording)
+    if plot:
+        from viewer.plot import plot as draw
+
+        draw(recording, plot)
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+    else:
+        tell(found, Console())
+        if plot:
+            print(f"picture: {plot}")
+
+
+@app.command
+def verify(folder: Path) -> None:
+    """Prove that live equals replay: process the raw log of a sortie again and compare with its recording, bit for bit.
+
+    Parameters
+    ----------
+    folder
+        A sortie folder.
+    """
+    from estimator.stage import estimate
+    from telemetry.ingest import ingest
+    from telemetry.messages import Estimate, Window
+    from viewer.review import compare
+
+    source, dialect, configuration = open_log(folder, None)
+    counts = {"estimates": 0, "windows": 0}
+
+    def replayed() -> Iterator[Message]:
+        for message in estimate(
+            ingest(source.batches(), source.links, dialect, configuration.ingest), configuration.estimate
+        ):
+            if isinstance(message, Estimate):
+                counts["estimates"] += len(message.t)
+            elif isinstance(message, Window):
+                counts["windows"] += 1
+            yield message
+
+    differences = compare(folder, replayed())
+    for difference in differences:
+        print(difference)
+    if differences:
+        raise Failure(f"{folder}: the recording and the replay of its raw log differ in {len(differences)} places")
+    if not counts["estimates"]:
+        raise Failure(f"{folder}: nothing was estimated, so nothing could be compared")
+    print(f"{folder}: live equals replay, bit for bit: {counts['estimates']} estimates, {counts['windows']} windows")
+
+
+@app.command
+def replay(log: Path, *, to: str, speed: float = 1.0, faults: str | None = None) -> None:
+    """Send a log over UDP as it was received.
+
+    Parameters
+    ----------
+    log
+        A .tlog file, or a sortie folder.
+    to
+        udpout:HOST:PORT.
+    speed
+        Times real time; inf is as fast as a receiver can follow.
+    faults
+        What the link does to it, e.g. loss=0.02,outage=60:5.
+    """
+    import sims
+
+    source, _, _ = open_log(log, None)
+    frames = ((int(batch.t_rx[i]), batch.frame(i)) for batch in source.batches() for i in range(len(batch)))
+    sent = sims.send(frames, to, speed=speed, faults=faults)
+    print(f"{counted(sent.datagrams, 'frame')} to {to} in {sent.took:.1f} s")
+
+
+@app.command
+def sim(
+    aircraft: str = "c172x",
+    *,
+    to: str,
+    manoeuvre: str = "demo",
+    sensors: str = "mems",
+    speed: float = 1.0,
+    faults: str | None = None,
+    seed: int = 1,
+    truth: Path | None = None,
+) -> None:
+    """Fly a simulated aircraft that speaks MAVLink over UDP.
+
+    Parameters
+    ----------
+    aircraft
+        A JSBSim aircraft.
+    to
+        udpout:HOST:PORT.
+    manoeuvre
+        The flight plan.
+    sensors
+        mems or fti.
+    speed
+        Times real time.
+    faults
+        What the link does, e.g. loss=0.02,outage=60:5.
+    seed
+        The same seed flies the same flight, bit for bit.
+    truth
+        Write the truth there, an .npz file.
+    """
+    import sims
+
+    flight = sims.fly(aircraft, manoeuvre, sensors=sensors, seed=seed)
+    if truth:
+        flight.truth.save(truth)
+    sent = sims.send(sims.frames(flight), to, speed=speed, faults=faults)
+    print(f"{sent.flown:.1f} s of flight, {counted(sent.datagrams, 'frame')} to {to} in {sent.took:.1f} s")
+
+
+@app.command
+def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED) -> None:
+    """Fly a simulated aircraft, record and smooth it live, and compare everything with the truth.
+
+    Parameters
+    ----------
+    folder
+        Where the sortie goes; sorties/demo-TIME if not given.
+    speed
+        Times real time; everything else is as in flight: the socket, the bus, the stages.
+    """
+    from rich.console import Console
+
+    import sims
+    import sims.accuracy
+    from sims.transmitter import free_port
+
+    console = Console(highlight=False)
+    name, folder = new_folder(
+        datetime.now(UTC).strftime("demo-%Y%m%d-%H%M%S") if folder is None else folder.name, folder
+    )
+    console.print("flying a Cessna 172: two turns (TP 1), a climb with 6 s without radio (TP 2), a 3-2-1-1 (TP 3)")
+    flight = sims.fly("c172x", "demo", sensors="mems", seed=1)
+    flight.truth.save(folder / "truth.npz")
+    port = free_port()
+    endpoint = f"udpin:127.0.0.1:{port}"
+    accuracy = sims.accuracy.Accuracy(flight)
+    sender = threading.Thread(
+        daemon=True,
+        target=lambda: sims.send(sims.frames(flight), f"udpout:127.0.0.1:{port}", speed=speed, faults=DEMO_FAULTS),
+    )
+
+    def ready() -> None:
+        console.print(f"live: MAVLink over {endpoint} at {speed:g}x real time -> zenoh -> estimator -> {folder}")
+        sender.start()
+
+    follow(
+        [endpoint],
+        name,
+        folder,
+        configure(None),
+        2.0,
+        ready,
+        lambda text: console.print("  " + text, markup=False),
+        accuracy.live,
+    )
+    sender.join()
+    console.print("post-sortie: the raw log once more, smoothed as a whole")
+    smooth_log(folder, folder / "smoothed.rrd", None, None, through=accuracy.smoothed)
+    verify(folder)
+    console.print(accuracy.table())
+    (folder / "accuracy.json").write_text(json.dumps(accuracy.figures(), indent=2))
+    from viewer.plot import plot as draw
+
+    draw(folder / "smoothed.rrd", folder / "smoothed.png")
+    console.print(
+        f"\nopen it:    {Path(sys.executable).parent / 'rerun'} {folder / 'live.rrd'} {folder / 'windows.rrd'}"
+    )
+    console.print(f"or:         {Path(sys.executable).parent / 'rerun'} {folder / 'smoothed.rrd'}")
+    console.print(f"review it:  {Path(sys.argv[0])} review {folder}")
+    console.print(f"picture:    {folder / 'smoothed.png'}", soft_wrap=True)
+
+
+@bench.command(name="smooth")
+def bench_smooth(log: Path | None = None) -> None:
+    """Where the time of a smoothing goes: read, decode, estimate, write.
+
+    Parameters
+    ----------
+    log
+        A .tlog file; a simulated flight of 170 s if not given.
+    """
+    import tempfile
+
+    import sims
+
+    spent = {"read": 0.0, "decode": 0.0, "estimate": 0.0}
+
+    def through(stage: str, stream: Iterable[Any]) -> Iterator[Any]:
+        iterator = iter(stream)
+        while True:
+            begin = time.perf_counter()
+            try:
+                item = next(iterator)
+            except StopIteration:
+                return
+            finally:
+                spent[stage] += time.perf_counter() - begin
+            yield item
+
+    with tempfile.TemporaryDirectory() as folder:
+        if log is None:
+            log = Path(folder) / "c172x.tlog"
+            flight = sims.fly("c172x", "demo")
+            sims.write_tlog(sims.frames(flight), log, flight.start_utc)
+        smooth_log(log, Path(folder) / "warm.rrd", None, None)
+        spent = dict.fromkeys(spent, 0.0)
+        begin = time.perf_counter()
+        summary = smooth_log(log, Path(folder) / "out.rrd", None, None, through)
+        total = time.perf_counter() - begin
+        size = log.stat().st_size
+        written = (Path(folder) / "out.rrd").stat().st_size
+    # Each stage pulls from the one before, so its time holds that of the one before.
+    own = {
+        "read": spent["read"],
+        "decode": spent["decode"] - spent["read"],
+        "estimate": spent["estimate"] - spent["decode"],
+        "write": total - spent["estimate"],
+    }
+    frames = sum(account.received for account in summary.accounts)
+    print(f"{log.name}: {size / 1e6:.1f} MB, {frames} frames -> {written / 1e6:.1f} MB, second run in one process")
+    for stage, seconds in own.items():
+        rate = frames / max(seconds, 1e-9) / 1e3
+        print(f"  {stage:9} {seconds:7.3f} s  {100 * seconds / total:5.1f} %  {rate:8.0f} k frames/s")
+    print(f"  {'all':9} {total:7.3f} s  100.0 %  {frames / total / 1e3:8.0f} k frames/s")
+
+
+def main() -> None:
+    """Run the command line: exit code 0 when the work is done, 1 when it failed, 2 when it was asked for wrongly."""
+    arguments = sys.argv[1:]
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    try:
+        app(arguments, exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        say(f"sortie: {' '.join(str(error).split())} (see sortie --help)")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        say("sortie: interrupted")
+        sys.exit(1)
+    except (Failure, OSError, ValueError) as error:
+        if debug:
+            raise
+        say(f"sortie: {_line(error)}")
+        sys.exit(1)
+
+
+def _line(error: Exception) -> str:
+    """One line for an error, with the file it is about."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,372 @@
+"""How the stages are chained: from a log into a recording, from a socket into a sortie folder.
+
+The command line (`sortie`) asks, and the rooms do the work; this file only connects them. Nothing heavy is imported
+before it is needed.
+
+A sortie folder::
+
+    raw.tlog      the evidence: every byte received, with its time
+    live.rrd      raw samples, live estimate, events, links
+    windows.rrd   smoothed windows, a layer of the same recording
+    report.json   the summary that the recording holds too
+    sortie.toml   what ran: endpoints, settings, versions
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from telemetry.messages import Message
+    from viewer.summary import Summary
+
+DISTRIBUTION = "sortie-telemetry"
+
+
+class Failure(Exception):
+    """The work failed, for a reason that one line can tell."""
+
+
+def say(text: str) -> None:
+    """Tell the user something that is not the result."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def configure(path: Path | None) -> Any:
+    """Settings of the stages, from a TOML file with the tables [ingest] and [estimate]."""
+    import msgspec
+
+    import estimator.stage
+    import telemetry.ingest
+
+    kind = msgspec.defstruct(
+        "Configuration",
+        [
+            ("ingest", telemetry.ingest.Settings, telemetry.ingest.Settings()),
+            ("estimate", estimator.stage.Settings, estimator.stage.Settings()),
+        ],
+        forbid_unknown_fields=True,
+        frozen=True,
+    )
+    if path is None:
+        return kind()
+    try:
+        return msgspec.toml.decode(path.read_bytes(), type=kind)
+    except msgspec.DecodeError as error:
+        raise Failure(f"{path}: {error}") from None
+
+
+def also(messages: Iterable[Message], stage: Callable[[Iterable[Message]], Iterable[Message]]) -> Iterator[Message]:
+    """The messages, and among them what a stage makes of them."""
+    passed: deque[Message] = deque()
+
+    def tap() -> Iterator[Message]:
+        for message in messages:
+            passed.append(message)
+            yield message
+
+    for made in stage(tap()):
+        while passed:
+            yield passed.popleft()
+        yield made
+    yield from passed
+
+
+def write_what_runs(folder: Path, name: str, endpoints: Sequence[str], configuration: Any, dialect: Any) -> None:
+    """Leave sortie.toml in a sortie folder."""
+    import msgspec
+
+    what = {
+        "sortie": name,
+        "endpoints": list(endpoints),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {
+            package: version(package) for package in (DISTRIBUTION, "pymavlink", "eclipse-zenoh", "rerun-sdk")
+        },
+        "dialect": {"name": dialect.name, "sha256": dialect.digest},
+        "settings": msgspec.to_builtins(configuration),
+    }
+    (folder / "sortie.toml").write_bytes(msgspec.toml.encode(what))
+
+
+def _read_what_ran(folder: Path) -> tuple[str, int, Any]:
+    """Name, number of links and settings of a sortie folder."""
+    import msgspec
+
+    path = folder / "sortie.toml"
+    if not path.is_file():
+        raise Failure(f"{folder} is no sortie folder: it has no sortie.toml")
+    ran = msgspec.toml.decode(path.read_bytes())
+    return ran["sortie"], len(ran["endpoints"]), msgspec.convert(ran["settings"], type(configure(None)))
+
+
+def open_log(log: Path, configuration: Any, on_progress: Callable[[int], None] | None = None) -> tuple[Any, Any, Any]:
+    """Source, dialect and settings of a log, or of a sortie folder and what ran there."""
+    from telemetry.mavlink import Dialect
+    from telemetry.sources.tlog import TlogSource
+
+    links = 1
+    if log.is_dir():
+        _, links, ran = _read_what_ran(log)
+        configuration = configuration or ran
+        log = log / "raw.tlog"
+    configuration = configuration or configure(None)
+    dialect = Dialect(configuration.ingest.dialect)
+    return TlogSource(log, dialect, links=links, on_progress=on_progress), dialect, configuration
+
+
+def new_folder(name: str | None, folder: Path | None, *, shared: bool = False) -> tuple[str, Path]:
+    """Name and folder of a new sortie; `shared` by several processes, it may exist."""
+    name = name or datetime.now(UTC).strftime("sortie-%Y%m%d-%H%M%S")
+    folder = folder or Path("sorties") / name
+    if not shared and folder.exists() and any(folder.iterdir()):
+        raise Failure(
+            f"{folder} exists and is not empty: a sortie is never overwritten; choose another --folder or --sortie"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise Failure(f"{folder} cannot be written to: choose another --folder")
+    return name, folder
+
+
+def watch(messages: Iterable[Message], tell: Callable[[str], None], *, every: bool = True) -> Iterator[Message]:
+    """Pass messages on and say what an engineer would look up for; unless `every`, only warnings and test points."""
+    import numpy as np
+
+    from telemetry.messages import Event, Window
+
+    for message in messages:
+        if isinstance(message, Event):
+            for t, level, text in zip(message.t.tolist(), message.level, message.text, strict=True):
+                if every or level != "info":
+                    tell(f"{_clock(t)} {text}" if level == "info" else f"{_clock(t)} {level}: {text}")
+        elif isinstance(message, Window) and (every or message.test_point):
+            name = f"test point {message.test_point}" if message.test_point else f"window {message.number}"
+            sigma = ", ".join(
+                f"{message.names[i]} {np.median(message.std[:, i]):.2f} {message.units[i]}" for i in (0, 4, 1)
+            )
+            seconds = (message.t[-1] - message.t[0]) * 1e-9
+            tell(f"{_clock(int(message.t[-1]))} {name}, {seconds:.1f} s, closed by {message.reason}; sigma: {sigma}")
+        yield message
+
+
+def _clock(t: int) -> str:
+    return datetime.fromtimestamp(t // 1_000_000_000, UTC).strftime("%H:%M:%S")
+
+
+class _Stages:
+    """Threads that run stages on a bus; their first failure is raised when they are joined."""
+
+    def __init__(self) -> None:
+        self.failures: list[Exception] = []
+        self._threads: list[threading.Thread] = []
+
+    def run(self, name: str, function: Callable[[], object]) -> None:
+        def guarded() -> None:
+            try:
+                function()
+            except Exception as error:
+                self.failures.append(error)
+
+        thread = threading.Thread(target=guarded, name=name, daemon=True)
+        thread.start()
+        self._threads.append(thread)
+
+    def join(self) -> None:
+        for thread in self._threads:
+            thread.join()
+        if self.failures:
+            raise self.failures[0]
+
+
+def stop_on_signals(stop: Callable[[], None]) -> None:
+    """The first Ctrl-C or SIGTERM ends the input, so that everything closes in order; the second kills."""
+
+    def handle(*_: object) -> None:
+        say("closing: the window, the recording and the raw log (again to abandon)")
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        stop()
+
+    signal.signal(signal.SIGINT, handle)
+    signal.signal(signal.SIGTERM, handle)
+
+
+def _warm_up(dialect: Any) -> None:
+    """Load and compile before a socket is open: what arrives meanwhile would be lost."""
+    import estimator.stage
+    import telemetry.ingest
+
+    telemetry.ingest.warm_up(dialect)
+    estimator.stage.warm_up()
+
+
+def record_folder(messages: Iterable[Message], folder: Path, name: str, properties: dict[str, str]) -> Summary:
+    """Record what comes over the bus into a sortie folder."""
+    import msgspec
+
+    from viewer.recorder import record
+
+    summary = record(
+        messages,
+        folder / "live.rrd",
+        windows=folder / "windows.rrd",
+        sortie=name,
+        properties=properties,
+        on_alarm=lambda text: say(f"ALARM: {text}"),
+    )
+    (folder / "report.json").write_bytes(msgspec.json.format(msgspec.json.encode(summary)))
+    return summary
+
+
+def follow(
+    endpoints: Sequence[str],
+    name: str,
+    folder: Path,
+    configuration: Any,
+    idle: float | None,
+    ready: Callable[[], None],
+    tell: Callable[[str], None],
+    keep: Callable[[Message], None] | None = None,
+) -> Summary:
+    """Receive, archive, estimate and record in one process, over an embedded bus.
+
+    Parameters
+    ----------
+    endpoints, name, folder, configuration
+        What to listen to, and where to write it.
+    idle : float or None
+        Stop by itself after so many seconds of silence.
+    ready : callable
+        Called when everything is listening.
+    tell : callable
+        Given a line for every event and window.
+    keep : callable, optional
+        Given every message.
+    """
+    from functools import partial
+
+    from estimator.stage import estimate
+    from telemetry.archive import RawLog
+    from telemetry.bus import Bus, publish, serve
+    from telemetry.ingest import ingest
+    from telemetry.mavlink import Dialect
+    from telemetry.sources.udp import UdpSource
+
+    dialect = Dialect(configuration.ingest.dialect)
+    _warm_up(dialect)
+    raw_log = RawLog(folder / "raw.tlog", links=len(endpoints))
+    try:
+        source = UdpSource(endpoints, dialect, raw_log)
+    except BaseException:
+        raw_log.close()
+        raw_log.path.unlink()
+        raise
+    write_what_runs(folder, name, endpoints, configuration, dialect)
+    stop_on_signals(source.stop)
+    stages = _Stages()
+    with Bus(name) as bus:
+        subscription = bus.subscribe("record", ["ingest", "estimate"])
+        stages.run(
+            "estimate", lambda: serve(bus, "estimate", ["ingest"], partial(estimate, settings=configuration.estimate))
+        )
+        stages.run(
+            "ingest",
+            lambda: publish(bus, "ingest", ingest(source.batches(idle), source.links, dialect, configuration.ingest)),
+        )
+        ready()
+
+        def received() -> Iterator[Message]:
+            alarm = None
+            for message in subscription:
+                if raw_log.error != alarm:
+                    alarm = raw_log.error
+                    tell(f"ALARM: {alarm}" if alarm else "raw telemetry is being kept again")
+                if message is not None:
+                    if keep:
+                        keep(message)
+                    yield message
+
+        summary = record_folder(watch(received(), tell), folder, name, {"endpoints": " ".join(endpoints)})
+        subscription.close()
+        stages.join()
+    return summary
+
+
+def smooth_log(
+    log: Path,
+    output: Path,
+    configuration: Any,
+    tell: Callable[[str], None] | None,
+    through: Callable[[str, Iterable[Any]], Iterable[Any]] = lambda _, stream: stream,
+) -> Summary:
+    """Smooth a log, each boot as a whole, into one recording.
+
+    Parameters
+    ----------
+    log, output, configuration
+        The log or sortie folder, the recording, and settings if not those of the folder.
+    tell : callable or None
+        Given a line for every warning and test point; None also hides the progress bar.
+    through : callable
+        Every stream that one stage hands to the next passes through it, with the stage's name.
+    """
+    from functools import partial
+
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from estimator.stage import estimate
+    from telemetry.ingest import ingest
+    from viewer.recorder import record
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeElapsedColumn()
+    hidden = tell is None or not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=hidden) as bar:
+        task = bar.add_task(f"smoothing {log.name}", total=None)
+        source, dialect, configuration = open_log(log, configuration, lambda done: bar.update(task, completed=done))
+        bar.update(task, total=source.size)
+        frames = through("read", source.batches())
+        samples = through("decode", ingest(frames, source.links, dialect, configuration.ingest))
+        whole = partial(estimate, settings=configuration.estimate, scope="sortie")
+        messages = through("estimate", also(samples, whole))
+        if tell:
+            messages = watch(messages, lambda text: bar.console.out(text, highlight=False), every=False)
+        properties = {
+            "log": source.path.name,
+            "bytes": str(source.size),
+            "dialect": dialect.name,
+            "dialect_sha256": dialect.digest,
+        }
+        return record(
+            messages,
+            output,
+            sortie=output.stem,
+            completeness=lambda: _completeness(source),
+            interval=None,
+            properties=properties,
+        )
+
+
+def _completeness(source: Any) -> str:
+    damage = []
+    if source.truncated:
+        damage.append(f"truncated: the log ends inside a record, {source.truncated} bytes left out")
+    if source.discarded:
+        damage.append(f"damaged: {source.discarded} bytes were no frame")
+    return "; ".join(damage) or "complete"
+
+
+def counted(number: int, what: str) -> str:
+    """A number of things, in words."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
