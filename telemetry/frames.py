@@ -261,7 +261,7 @@ def _scan_tlog(data, final, aligned, last, extra, table, rows, known, junk, corr
                 if i + 15 + size <= n:
                     t = _time_at(data, i)
                     if 0 <= t < LATEST:
-                        last = t
+                        last = t  # type: ignore[assignment]
                     junk[runs, 0], junk[runs, 1], junk[runs, 2] = i + 15, size, last
                     status, length, msgid = _frame_at(data, i + 15, i + 15 + size, extra, table)
                     corrupt[runs] = status == _CORRUPT or (status == _SHORT and length > 0)

@@ -1,0 +1,257 @@
+"""Samples become estimates and windows, the same ones however the samples came."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from estimator.models.trajectory import NAMES
+from estimator.stage import Settings, estimate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from telemetry.messages import Altitude, Estimate, Event, Gnss, Mark, Message, Progress, Window
+
+S = 1_000_000_000
+RADIUS = 6_378_137.0
+
+
+def flight(seconds=40.0, *, vehicle=1, boot=0, begin=1000.0, silence=(), seed=1) -> list[Message]:
+    """Single samples of a vehicle flying north at 20 m/s in the order of their arrival, a fix at 5 Hz and pressure at 10 Hz."""
+    random = np.random.default_rng(seed)
+    out: list[tuple[int, Message]] = []
+    for i in range(int(10 * seconds)):
+        t = begin + 0.1 * i
+        if any(a <= t - begin < b for a, b in silence):
+            continue
+        delay = random.exponential(0.02)
+        common = {"vehicle": vehicle, "source": "0/1", "boot": boot}
+        times = {"t": np.array([round(t * S)]), "t_rx": np.array([round((t + delay) * S)])}
+        altitude = np.array([500.0 + random.normal() * 0.5])
+        out.append(
+            (
+                times["t_rx"][0],
+                Altitude(**common, **times, altitude=altitude + 30, pressure=np.ones(1), sigma=np.full(1, 0.5)),
+            )
+        )
+        if i % 2 == 0:
+            late = {"t": times["t"] - S // 20, "t_rx": times["t_rx"] + 1}
+            latitude = np.array([0.8 + (20 * (t - begin) + random.normal()) / RADIUS])
+            velocity = np.array([[20.0, 0.0, np.nan]]) + random.normal(size=(1, 3)) * 0.2
+            out.append(
+                (
+                    late["t_rx"][0],
+                    Gnss(
+                        **common,
+                        **late,
+                        latitude=latitude,
+                        longitude=np.array([0.2]),
+                        altitude=altitude,
+                        velocity=velocity,
+                        sigma=np.array([[2.0, 3.0, 0.3]]),
+                        satellites=np.array([9]),
+                    ),
+                )
+            )
+    return [message for _, message in sorted(out, key=lambda item: item[0])]
+
+
+def mark(t: float, action: str, name: str, boot=0) -> Mark:
+    when = np.array([round(t * S)])
+    return Mark(vehicle=1, source="0/1", boot=boot, t=when, t_rx=when + 1, action=[action], name=[name])
+
+
+def progress(messages, final=False) -> Progress:
+    t = np.array([max(int(m.t_rx[-1]) for m in messages)])
+    return Progress(vehicle=0, source="ingest", boot=0, t=t, t_rx=t, final=final)
+
+
+def run(messages, cuts=None, scope="window", options=None) -> list[Message]:
+    messages = sorted(messages, key=lambda m: int(m.t_rx[0]))
+    edges = sorted({0, len(messages), *(cuts or [])})
+    stream: list[Message] = []
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        stream += [*messages[a:b], progress(messages[:b], final=b == len(messages))]
+    return list(estimate(stream, options or Settings(), scope=scope))
+
+
+def told(messages, kind):
+    return [m for m in messages if isinstance(m, kind)]
+
+
+def live(messages, boot=0):
+    found = [m for m in told(messages, Estimate) if m.boot == boot]
+    return {
+        name: np.concatenate([getattr(m, name) for m in found])
+        for name in ("t", "t_rx", "mean", "std", "nis", "dof", "geodetic")
+    }
+
+
+def smoothed(messages, boot=0):
+    found = [m for m in told(messages, Window) if m.boot == boot]
+    return {name: np.concatenate([getattr(m, name) for m in found]) for name in ("t", "mean", "std", "geodetic")}
+
+
+FLIGHT = flight()
+
+
+@given(st.lists(st.integers(1, len(FLIGHT) - 1), max_size=30), st.sampled_from(["window", "sortie"]))
+@settings(max_examples=15, deadline=None)
+def test_batches_do_not_change_a_bit(cuts, scope):
+    messages = [
+        *FLIGHT,
+        mark(1010, "start", "1"),
+        mark(1022, "stop", "1"),
+        *flight(20, boot=1, begin=1100, silence=[(5, 11)]),
+    ]
+    whole, parts = run(messages, scope=scope), run(messages, cuts, scope=scope)
+    for boot in (0, 1):
+        for a, b in ((live(whole, boot), live(parts, boot)), (smoothed(whole, boot), smoothed(parts, boot))):
+            for name in a:
+                np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+    about = ("boot", "number", "test_point", "reason", "measurements", "late", "anchors", "nis", "dof", "digest")
+    assert [[getattr(m, a) for a in about] for m in told(parts, Window)] == [
+        [getattr(m, a) for a in about] for m in told(whole, Window)
+    ]
+
+
+def test_every_live_step_is_smoothed_once_and_never_less_sure():
+    out = run([*FLIGHT, mark(1015, "start", "1"), mark(1025, "stop", "1")])
+    before, after = live(out), smoothed(out)
+    np.testing.assert_array_equal(before["t"], after["t"])
+    assert (after["std"] <= before["std"] * (1 + 1e-12)).all()
+    assert np.median(after["std"][:, 5] / before["std"][:, 5]) < 0.8
+
+
+def test_the_whole_sortie_knows_more_than_its_windows():
+    by_window, whole = smoothed(run(FLIGHT)), smoothed(run(FLIGHT, scope="sortie"))
+    assert (whole["std"] <= by_window["std"] * (1 + 1e-9)).all()
+    assert (whole["std"][:250] < by_window["std"][:250]).any()
+    np.testing.assert_array_equal(live(run(FLIGHT))["mean"], live(run(FLIGHT, scope="sortie"))["mean"])
+
+
+def test_the_windows_of_a_sortie_are_one_smoothing():
+    """However short the windows, the smoothing of the whole sortie is the same."""
+    long = smoothed(run(FLIGHT, scope="sortie", options=Settings(window=1000)))
+    short = smoothed(run(FLIGHT, scope="sortie", options=Settings(window=2)))
+    np.testing.assert_allclose(short["mean"], long["mean"], atol=1e-7)
+    np.testing.assert_allclose(short["std"], long["std"], rtol=1e-7)
+
+
+def test_the_estimate_is_where_the_vehicle_is():
+    out = smoothed(run(FLIGHT))
+    late = out["t"] > 1010 * S
+    north = 20 * (out["t"] / S - 1000.0)
+    assert np.abs(out["mean"][late, 0] - north[late]).max() < 4 * np.median(out["std"][late, 0])
+    assert np.abs(out["mean"][late, 1] - 20).max() < 1.0
+    assert np.abs(out["geodetic"][late, 0] - (0.8 + north[late] / RADIUS)).max() * RADIUS < 10
+    assert np.abs(out["mean"][late, NAMES.index("altimeter_bias")] - 30).max() < 8
+
+
+def test_marks_make_test_points():
+    out = run([*FLIGHT, mark(1010, "start", "12"), mark(1020, "stop", "12")])
+    found = [(w.test_point, w.reason, round(w.t[0] / S, 1), round(w.t[-1] / S, 1)) for w in told(out, Window)]
+    assert [f[:2] for f in found] == [("", "mark"), ("12", "mark"), ("", "end")]
+    assert 1010 < found[1][2] <= 1010.1
+    assert 1019.9 <= found[1][3] <= 1020
+
+
+def test_a_test_point_is_not_cut_by_the_length_of_windows():
+    out = run([*FLIGHT, mark(1005, "start", "1"), mark(1035, "stop", "1")], options=Settings(window=5))
+    (point,) = [w for w in told(out, Window) if w.test_point]
+    assert (point.t[-1] - point.t[0]) / S > 29
+
+
+def test_a_stop_that_was_never_started_is_told_and_ignored():
+    out = run([*FLIGHT, mark(1010, "stop", "7")])
+    assert any("test point 7 stopped without having been started" in e.text[0] for e in told(out, Event))
+    assert [w.reason for w in told(out, Window)] == ["length", "end"]
+
+
+def test_windows_close_by_length():
+    out = run(FLIGHT, options=Settings(window=10))
+    assert [w.reason for w in told(out, Window)] == ["length", "length", "length", "end"]
+    assert all((w.t[-1] - w.t[0]) / S <= 10 for w in told(out, Window))
+
+
+def test_no_window_crosses_a_boot():
+    out = run([*FLIGHT, *flight(20, boot=1, begin=1060)])
+    assert [(w.boot, w.reason) for w in told(out, Window)] == [(0, "length"), (0, "reboot"), (1, "end")]
+    assert all(w.number == 0 for w in told(out, Window) if w.boot == 1)
+    first = live(out, boot=1)
+    assert first["std"][0, 5] > 100, "the climb rate of another boot is not this one's"
+
+
+def test_a_silence_closes_the_window_and_its_growing_uncertainty_is_seen():
+    out = run(flight(30, silence=[(10, 20)]))
+    found = live(out)
+    gap = (found["t"] > 1010 * S) & (found["t"] < 1019.9 * S)
+    assert gap.sum() >= 18
+    assert (found["dof"][gap] == 0).all()
+    assert (np.diff(found["std"][gap, 0]) > 0).all()
+    assert [w.reason for w in told(out, Window)] == ["gap", "end"]
+    (text,) = [e.text[0] for e in told(out, Event) if "without a measurement" in e.text[0]]
+    assert text.startswith("10.1 s without a measurement: std(north)")
+    middle = smoothed(out)["std"][gap, 0].max()
+    assert 1 < middle < found["std"][gap, 0].max(), "bridged from both sides, and unsure in the middle"
+
+
+def test_a_test_point_that_a_silence_cuts_stays_one():
+    out = run([*flight(30, silence=[(10, 20)]), mark(1005, "start", "3"), mark(1025, "stop", "3")])
+    assert [(w.test_point, w.reason) for w in told(out, Window)] == [
+        ("", "mark"),
+        ("3", "gap"),
+        ("3", "mark"),
+        ("", "end"),
+    ]
+
+
+def test_without_a_fix_nothing_is_estimated_and_that_is_said():
+    out = run([m for m in FLIGHT if isinstance(m, Altitude)])
+    assert not told(out, Estimate)
+    assert not told(out, Window)
+    assert "no satellite fix in boot 0: nothing to estimate from 400 samples" in told(out, Event)[0].text[0]
+
+
+def test_samples_before_the_first_fix_are_not_used():
+    early = [m for m in flight(40) if isinstance(m, Altitude) or m.t[0] > 1010 * S]
+    assert live(run(early))["t"][0] >= 1009.9 * S
+
+
+def test_late_samples_are_counted_where_they_were_missed():
+    late = Altitude(
+        vehicle=1,
+        source="0/1",
+        boot=0,
+        t=np.array([1010 * S]),
+        t_rx=np.array([1015 * S]),
+        altitude=np.full(1, 9e3),
+        pressure=np.ones(1),
+        sigma=np.ones(1),
+    )
+    out, without = run([*FLIGHT, late]), run(FLIGHT)
+    assert [w.late for w in told(out, Window)] == [{"altitude": 1}, {}]
+    np.testing.assert_array_equal(live(out)["mean"], live(without)["mean"])
+
+
+def test_vehicles_do_not_touch_one_another():
+    both = run([*FLIGHT, *flight(vehicle=2, seed=9, silence=[(3, 8)])])
+    alone = run(FLIGHT)
+    mine = [m for m in told(both, Estimate) if m.vehicle == 1]
+    np.testing.assert_array_equal(np.concatenate([m.mean for m in mine]), live(alone)["mean"])
+
+
+def test_consistent_errors_give_a_consistent_nis():
+    """White errors of the stated size, and a model that says they are white."""
+    from estimator.models import trajectory
+
+    quiet = trajectory.Settings(gnss_correlated_share=0.0, acceleration_horizontal=0.1, acceleration_vertical=0.1)
+    found = live(run(flight(120, seed=5), options=Settings(trajectory=quiet)))
+    known = found["t"] > 1005 * S
+    ratio = found["nis"][known].sum() / found["dof"][known].sum()
+    assert 0.3 < ratio < 1.2
+
+
+def test_settings_refuse_what_they_do_not_know():
+    import msgspec
+
+    with pytest.raises(msgspec.ValidationError, match="unknown field `windw`"):
+        msgspec.convert({"windw": 3}, Settings)
