@@ -1,0 +1,183 @@
+"""Books: kept of a recording while it is written, in constant memory per vehicle, sensor and link."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from telemetry.messages import (
+    SENSORS,
+    ClockFit,
+    Estimate,
+    Event,
+    LinkBytes,
+    LinkStats,
+    Mark,
+    Message,
+    Progress,
+    StatusText,
+    Window,
+)
+from viewer.columns import Seam
+from viewer.summary import (
+    Account,
+    Age,
+    Boot,
+    ByteAccount,
+    Clock,
+    Live,
+    Sensor,
+    Silence,
+    Summary,
+    Vehicle,
+    finite,
+    smoothed,
+)
+
+COUNTERS = ("received", "lost", "late", "out_of_order", "duplicate", "conflict", "ambiguous", "restarted")
+BYTES = ("bytes", "frames", "unknown", "corrupt", "discarded", "pending")
+LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+SEVERITIES = ("CRITICAL", "CRITICAL", "CRITICAL", "ERROR", "WARN", "INFO", "INFO", "DEBUG")
+
+
+class Books:
+    """Counts what passes by.
+
+    Parameters
+    ----------
+    sortie : str
+    gap : float
+        Silence from which a sensor counts as interrupted, s.
+    """
+
+    def __init__(self, sortie: str, gap: float) -> None:
+        self.summary = Summary(sortie=sortie, completeness="not closed", gap=gap, properties={}, events={}, alarms=[])
+        self._vehicles: dict[int, Vehicle] = {}
+        self._sensors: dict[tuple[int, str, str], tuple[Sensor, Seam]] = {}
+        self._clocks: dict[tuple[int, int], Clock] = {}
+        self._links: dict[tuple[int, str], Account] = {}
+        self._bytes: dict[str, ByteAccount] = {}
+        self._ages: list[float] = []
+
+    def vehicle(self, number: int) -> Vehicle:
+        """The books of one vehicle, opened when first asked for."""
+        if number not in self._vehicles:
+            self._vehicles[number] = Vehicle(vehicle=number, boots=[], silences=[], sensors=[], clocks=[])
+        return self._vehicles[number]
+
+    def add(self, message: Message, now: int | None = None) -> None:
+        """Count a message; ``now`` is the wall time in ns of a live recording."""
+        whole, t, t_rx = self.summary, message.t, message.t_rx
+        whole.messages += 1
+        if isinstance(message, Progress):
+            return
+        first = whole.rows == 0
+        whole.rows += len(t)
+        low, high, rx = int(t.min()), int(t.max()), (int(t_rx.min()), int(t_rx.max()))
+        whole.t0, whole.t1 = (low, high) if first else (min(whole.t0, low), max(whole.t1, high))
+        whole.t_rx0, whole.t_rx1 = rx if first else (min(whole.t_rx0, rx[0]), max(whole.t_rx1, rx[1]))
+        match message:
+            case Estimate():
+                self._estimate(message)
+                if now is not None:
+                    self._ages.append((now - int(t_rx[-1])) / 1e9)
+            case Window():
+                whole.windows.append(smoothed(message))
+            case Event():
+                for level in message.level:
+                    self._level(LEVELS[level])
+            case StatusText():
+                for severity in message.severity.tolist():
+                    self._level(SEVERITIES[min(max(severity, 0), 7)])
+            case Mark():
+                for _ in message.action:
+                    self._level("INFO")
+            case ClockFit():
+                self._clock(message)
+            case LinkStats():
+                counts = {name: int(getattr(message, name)[-1]) for name in COUNTERS}
+                self._links[message.vehicle, message.source] = Account(
+                    vehicle=message.vehicle, source=message.source, loss=finite(message.loss_total[-1]), **counts
+                )
+            case LinkBytes():
+                counts = {name: int(getattr(message, name)[-1]) for name in BYTES}
+                self._bytes[message.source] = ByteAccount(source=message.source, **counts)
+        if isinstance(message, SENSORS):
+            self._sensor(message, low, high)
+            self._boot(message.vehicle, message.boot, (low, high), rx)
+
+    def silent(self, vehicle: int, boot: int, t0: int, t1: int) -> None:
+        """Note a silence of a whole vehicle."""
+        self.vehicle(vehicle).silences.append(Silence(boot=boot, t0=t0, t1=t1))
+
+    def close(self, completeness: str, alarms: Sequence[str]) -> Summary:
+        """The books, balanced."""
+        whole = self.summary
+        whole.completeness = completeness
+        whole.alarms = list(alarms)
+        for (number, _, _), (sensor, seam) in sorted(self._sensors.items(), key=lambda item: item[0]):
+            sensor.gaps, sensor.silence = seam.count, seam.silence / 1e9
+            boots = self.vehicle(number).boots
+            between = sum(max(0, b.t0 - a.t1) for a, b in pairwise(boots))  # nobody measures while rebooting
+            heard = (sensor.t1 - sensor.t0 - seam.silence - between) / 1e9
+            steps = sensor.samples - 1 - seam.count
+            sensor.rate = steps / heard if steps > 0 and heard > 0 else None
+            self.vehicle(number).sensors.append(sensor)
+        for (number, _), clock in sorted(self._clocks.items()):
+            self.vehicle(number).clocks.append(clock)
+        whole.vehicles = [self._vehicles[number] for number in sorted(self._vehicles)]
+        whole.accounts = [self._links[key] for key in sorted(self._links)]
+        whole.byte_accounts = [self._bytes[key] for key in sorted(self._bytes)]
+        if self._ages and float(np.median(self._ages)) < 3600.0:  # else the stream was not live
+            p50, p99 = np.percentile(self._ages, [50, 99])
+            whole.age = Age(p50=float(p50), p99=float(p99), max=max(self._ages))
+        return whole
+
+    def _level(self, level: str) -> None:
+        self.summary.events[level] = self.summary.events.get(level, 0) + 1
+
+    def _estimate(self, message: Estimate) -> None:
+        vehicle = self.vehicle(message.vehicle)
+        if vehicle.live is None:
+            vehicle.live = Live(model=message.model, names=[], units=[])
+        live = vehicle.live
+        live.model, live.names, live.units = message.model, list(message.names), list(message.units)
+        live.rows += len(message.t)
+        live.determined += int((np.isfinite(message.mean) & np.isfinite(message.std)).all(axis=1).sum())
+        tested = np.isfinite(message.nis) & (message.dof > 0)
+        live.nis += math.fsum(message.nis[tested].tolist())
+        live.dof += int(message.dof[tested].sum())
+
+    def _sensor(self, message: Message, low: int, high: int) -> None:
+        key = (message.vehicle, message.stream, message.source)
+        if key not in self._sensors:
+            self.vehicle(message.vehicle)
+            self._sensors[key] = (
+                Sensor(sensor=message.stream, source=message.source, t0=low, t1=high),
+                Seam(self.summary.gap),
+            )
+        sensor, seam = self._sensors[key]
+        seam.find(message.boot, message.t, message.t_rx)
+        sensor.samples += len(message.t)
+        sensor.t0, sensor.t1 = min(sensor.t0, low), max(sensor.t1, high)
+
+    def _boot(self, number: int, boot: int, t: tuple[int, int], t_rx: tuple[int, int]) -> None:
+        boots = self.vehicle(number).boots
+        known = next((b for b in boots if b.boot == boot), None)
+        if known is None:
+            boots.append(Boot(boot=boot, t0=t[0], t1=t[1], t_rx0=t_rx[0], t_rx1=t_rx[1]))
+            boots.sort(key=lambda b: b.boot)
+        else:
+            known.t0, known.t1 = min(known.t0, t[0]), max(known.t1, t[1])
+            known.t_rx0, known.t_rx1 = min(known.t_rx0, t_rx[0]), max(known.t_rx1, t_rx[1])
+
+    def _clock(self, message: ClockFit) -> None:
+        self.vehicle(message.vehicle)
+        fields = ("offset", "offset_sigma", "rate", "rate_sigma", "delay_p50", "delay_p99", "delay_max", "span")
+        numbers = {name: finite(getattr(message, name)[-1]) for name in fields}
+        self._clocks[message.vehicle, message.boot] = Clock(
+            boot=message.boot, reference=message.reference[-1], valid=bool(message.valid[-1]), **numbers
+        )

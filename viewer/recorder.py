@@ -1,0 +1,283 @@
+"""Recorder: messages into one Rerun recording, by columns, headless."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import rerun as rr
+
+from telemetry.messages import (
+    SENSORS,
+    ClockFit,
+    Estimate,
+    Event,
+    Gnss,
+    LinkBytes,
+    LinkStats,
+    Mark,
+    Message,
+    Progress,
+    StatusText,
+    Window,
+)
+from viewer.blueprint import layout
+from viewer.books import BYTES, COUNTERS, Books
+from viewer.columns import GAP, Seam, runs, slug, vehicle_path
+from viewer.drawing import Drawing, Group
+from viewer.sink import Sink, claim
+from viewer.summary import Summary
+from viewer.track import Track
+
+ROWS = 8192  # rows of one entity that are worth a chunk of their own, whatever the time
+
+
+def record(
+    messages: Iterable[Message],
+    path: str | Path,
+    *,
+    windows: str | Path | None = None,
+    sortie: str,
+    completeness: str | Callable[[], str] = "complete",
+    properties: Mapping[str, str] | None = None,
+    interval: float | None = 0.1,
+    on_alarm: Callable[[str], None] | None = None,
+) -> Summary:
+    """Write a stream of messages into a recording.
+
+    Parameters
+    ----------
+    messages : iterable of Message
+        Any kinds, several vehicles, several boot epochs.
+    path : path
+        New file for everything; for everything but the windows if ``windows`` is given.
+    windows : path, optional
+        New file for the windows: a layer of the same recording.
+    sortie : str
+        Name, and recording id.
+    completeness : str or callable
+        What is known of the input; a callable is asked at the end. Without any sample it becomes "no data".
+    properties : mapping of str to str, optional
+        What ran: stored in the recording.
+    interval : float or None
+        Receive time after which what waits is written, s; None offline, where only full chunks are.
+    on_alarm : callable, optional
+        Told when writing fails or works again. Recording goes on.
+
+    Returns
+    -------
+    Summary
+        Also stored in the recording; a recording without it was not closed.
+
+    Raises
+    ------
+    FileExistsError
+        If a file exists: recordings are never overwritten.
+    OSError
+        If a file cannot be created.
+    """
+    recorder = Recorder(
+        path, windows=windows, sortie=sortie, properties=properties, interval=interval, on_alarm=on_alarm
+    )
+    try:
+        for message in messages:
+            recorder.write(message)
+    except BaseException:
+        recorder.close("interrupted")  # what has been recorded until here is kept
+        raise
+    return recorder.close(completeness() if callable(completeness) else completeness)
+
+
+class Recorder:
+    """A recording that grows by one message after the other; parameters as in `record`.
+
+    Parameters
+    ----------
+    gap : float
+        Silence across which no line is drawn, s.
+    serve : int, optional
+        Port on 127.0.0.1 at which a Rerun viewer may look on.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        windows: str | Path | None = None,
+        sortie: str,
+        properties: Mapping[str, str] | None = None,
+        interval: float | None = 0.1,
+        on_alarm: Callable[[str], None] | None = None,
+        gap: float = GAP,
+        serve: int | None = None,
+    ) -> None:
+        self._interval = math.inf if interval is None else interval * 1e9
+        self._live = interval is not None
+        self._gap = gap
+        self._tell = on_alarm
+        self._alarms: list[str] = []
+        path = Path(path)
+        claim(path)
+        if windows is not None:
+            try:
+                claim(Path(windows))
+            except OSError:
+                path.unlink()  # just created, empty
+                raise
+        self._main = Sink(path, sortie, self._alarm, serve=serve)
+        self._layer = self._main if windows is None else Sink(Path(windows), sortie, self._alarm, join=serve)
+        self._books = Books(sortie, gap)
+        self._books.summary.properties = dict(properties or {})
+        self._main.property(
+            "run", sortie=sortie, gap=gap, **{slug(key): str(value) for key, value in (properties or {}).items()}
+        )
+        self._drawing = Drawing(self._main, self._layer, gap, self._books.silent)
+        self._groups: dict[tuple[Any, ...], Group] = {}
+        self._components: dict[tuple[int, str], dict[str, str]] = {}
+        self._drawn: frozenset[str] = frozenset()
+        self._written_rx: int | None = None
+        self._slow_rx = 0
+        self._flushed = time.monotonic()
+
+    def write(self, message: Message) -> None:
+        """Take one message; writes when it is time to."""
+        self._books.add(message, time.time_ns() if self._live else None)
+        if isinstance(message, Progress):
+            self._drawing.presences()
+        else:
+            self._drawing.place(message)
+            if isinstance(message, Window):
+                self._drawing.window(message)
+            else:
+                group = self._group(message)
+                group.messages.append(message)
+                group.rows[0] += len(message.t)
+                if group.rows[0] >= ROWS:
+                    self._write(group)
+        if isinstance(message, SENSORS):
+            self._drawing.hear(message)
+        now = int(message.t_rx[-1])
+        if self._written_rx is None:
+            self._written_rx = now
+        if now - self._written_rx >= self._interval:
+            self._written_rx = now
+            slow = now - self._slow_rx >= 1e9
+            if slow:
+                self._slow_rx = now
+            self._write_all(quick=not slow)
+        if time.monotonic() - self._flushed >= 1.0:
+            self.flush()
+
+    def flush(self) -> None:
+        """Bring what has been written so far to the disk; a failure is an alarm, not an error."""
+        if self._live:
+            self._write_all(quick=True)
+        self._arrange()
+        self._main.flush()
+        if self._layer is not self._main:
+            self._layer.flush()
+        self._flushed = time.monotonic()
+
+    def close(self, completeness: str = "complete") -> Summary:
+        """Write what waits, store the summary and finish the files."""
+        self._write_all()
+        self._drawing.finish(list(self._groups.values()))
+        empty = self._books.summary.rows == 0
+        if empty:
+            self._main.static(
+                "/note", rr.TextDocument("# No data\nNot a single sample arrived.", media_type=rr.MediaType.MARKDOWN)
+            )
+        else:
+            self._main.started(self._books.summary.t_rx0)
+        self._arrange(last=True)
+        whole = [sink.flush() for sink in {id(s): s for s in (self._main, self._layer)}.values()]
+        if empty:
+            completeness = "no data"
+        elif (self._alarms and completeness == "complete") or not all(whole):
+            completeness = "truncated"
+        summary = self._books.close(completeness, self._alarms)
+        if self._drawing.origin is not None:
+            summary.origin = [*np.degrees(self._drawing.origin[:2]).tolist(), float(self._drawing.origin[2])]
+        self._main.property("sortie", completeness=completeness, summary=msgspec.json.encode(summary).decode())
+        if self._layer is not self._main:
+            self._layer.close()
+        self._main.close()
+        summary.alarms = list(self._alarms)
+        return summary
+
+    def _alarm(self, text: str) -> None:
+        self._alarms.append(text)
+        if self._tell is not None:
+            self._tell(text)
+
+    # -- where messages wait --
+
+    def _group(self, message: Message) -> Group:
+        root = vehicle_path(message.vehicle)
+        track = None
+        key: tuple[Any, ...]
+        match message:
+            case Event() | StatusText() | Mark():
+                key, parent = ("events",), "/events"
+            case LinkStats():
+                link, _, component = message.source.partition("/")
+                key = ("link", message.vehicle, message.source)
+                parent = f"/link/{slug(link)}/v{message.vehicle}" + (f".{slug(component)}" if component else "")
+            case LinkBytes():
+                key, parent = ("bytes", message.source), f"/link/{slug(message.source)}/bytes"
+            case ClockFit():
+                key, parent = ("clock", message.vehicle), f"{root}/clock"
+            case Estimate():
+                key, parent, track = ("live", message.vehicle), f"{root}/est/live", Track(joins=True)
+            case _:
+                component = message.source.partition("/")[2] or message.source
+                names = self._components.setdefault((message.vehicle, message.stream), {})
+                # The first component has the plain name; a second receiver stands beside it, not among its rows.
+                name = names.setdefault(
+                    component, message.stream if not names else f"{message.stream}.{slug(component)}"
+                )
+                key, parent = (message.vehicle, name), f"{root}/raw/{name}"
+                if message.stream == "gnss":
+                    track = Track(joins=False)
+        if key not in self._groups:
+            quick = isinstance(message, (Estimate, Gnss, Event, StatusText, Mark))
+            self._groups[key] = Group(parent, [], Seam(self._gap), track, [0], quick)
+        return self._groups[key]
+
+    def _write_all(self, *, quick: bool = False) -> None:
+        for group in self._groups.values():
+            if group.messages and (group.quick or not quick):
+                self._write(group)
+
+    def _write(self, group: Group) -> None:
+        messages = list(group.messages)
+        group.messages.clear()
+        group.rows[0] = 0
+        match messages[0]:
+            case Event() | StatusText() | Mark():
+                self._drawing.events(messages)
+            case LinkStats():
+                self._drawing.plain(group, messages, {"counters": COUNTERS, "loss": ("loss", "loss_total")})
+            case LinkBytes():
+                self._drawing.plain(group, messages, {"": BYTES})
+            case ClockFit():
+                self._drawing.clock(group, messages)
+            case Estimate():
+                for run in runs(messages):
+                    self._drawing.estimates(group, run)
+            case _:
+                for run in runs(messages):
+                    self._drawing.sensor(group, run)
+
+    def _arrange(self, *, last: bool = False) -> None:
+        """Store the layout anew when there is more to lay out."""
+        entities = frozenset(self._main.entities | self._layer.entities)
+        if last or entities != self._drawn:
+            self._drawn = entities
+            live = self._live and not last
+            self._main.layout(layout(entities, self._drawing.extents, live=live))

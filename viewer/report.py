@@ -1,0 +1,238 @@
+"""Report: a review in words and tables, and as JSON."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from viewer.summary import Clock, Summary, Vehicle, utc, verdict
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from viewer.review import Review
+
+LINES = 40  # lines of the event log that a report repeats; all of them are in the recording
+_LEVELS = ("CRITICAL", "ERROR", "WARN", "INFO", "DEBUG")
+_COLOURS = {"CRITICAL": "bold red", "ERROR": "red", "WARN": "yellow", "DEBUG": "dim"}
+
+
+def to_json(review: Review) -> bytes:
+    """The review as indented JSON."""
+    return msgspec.json.format(msgspec.json.encode(review))
+
+
+def tell(review: Review, console: Console) -> None:
+    """Print a review for a human reader.
+
+    Parameters
+    ----------
+    review : Review
+    console : rich.console.Console
+    """
+    summary = review.summary
+    good = summary.completeness == "complete" and review.closed and not review.remarks
+    console.print(
+        f"[bold]{_plain(summary.sortie) or 'unnamed sortie'}[/bold]: "
+        f"[{'green' if good else 'yellow'}]{_plain(summary.completeness)}[/]",
+        highlight=False,
+    )
+    for text in [*review.remarks, *summary.alarms]:
+        console.print(f"  ! {_plain(text)}", style="yellow", highlight=False)
+    if not summary.vehicles:
+        console.print("  no vehicle was heard")
+    else:
+        span = (summary.t_rx1 - summary.t_rx0) / 1e9
+        console.print(f"  {utc(summary.t_rx0)} UTC, {duration(span)}", highlight=False)
+    for key, value in summary.properties.items():
+        console.print(f"  {_plain(key)}: {_plain(value)}", style="dim", highlight=False)
+    for vehicle in summary.vehicles:
+        _vehicle(vehicle, console)
+    _links(summary, console)
+    if summary.windows:
+        console.print(_windows(summary))
+    _events(review, console)
+
+
+def duration(seconds: float) -> str:
+    """A length of time for humans, e.g. ``3 min 12 s``."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _plain(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)
+
+
+def _table(title: str, *columns: str) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        name, _, side = column.partition(">")
+        table.add_column(name, justify="right" if side == "" and column.endswith(">") else "left")
+    return table
+
+
+def _number(value: float | None, form: str = ".1f", unit: str = "") -> str:
+    return "-" if value is None else f"{value:{form}}{unit}"
+
+
+def _vehicle(vehicle: Vehicle, console: Console) -> None:
+    table = _table(
+        f"Vehicle {vehicle.vehicle}: measured", "sensor", "from", "samples>", "rate>", "interruptions>", "silent>"
+    )
+    for sensor in vehicle.sensors:
+        table.add_row(
+            sensor.sensor,
+            _plain(sensor.source),
+            str(sensor.samples),
+            _number(sensor.rate, ".1f", " Hz"),
+            str(sensor.gaps),
+            f"{sensor.silence:.1f} s",
+        )
+    console.print(table)
+    for boot in vehicle.boots:
+        console.print(
+            f"  boot {boot.boot}: {utc(boot.t0)} - {utc(boot.t1, date=False)} ({duration((boot.t1 - boot.t0) / 1e9)})",
+            highlight=False,
+        )
+        for clock in vehicle.clocks:
+            if clock.boot == boot.boot:
+                console.print(f"    clock: {_clock(clock)}", highlight=False)
+    for silence in vehicle.silences:
+        console.print(
+            f"  not heard: {utc(silence.t0, date=False)} - {utc(silence.t1, date=False)} "
+            f"({duration((silence.t1 - silence.t0) / 1e9)})",
+            style="yellow",
+            highlight=False,
+        )
+    live = vehicle.live
+    if live is not None:
+        ratio = (
+            f"NIS/dof {live.nis / live.dof:.2f}, {verdict(live.nis, live.dof)}"
+            if live.dof
+            else "no test of the innovations"
+        )
+        model = f"model {live.model}, " if live.model else ""
+        console.print(
+            f"  live estimate: {model}{live.rows} rows, {live.determined} of them with every state determined; {ratio}",
+            highlight=False,
+        )
+
+
+def _clock(clock: Clock) -> str:
+    if not clock.valid:
+        return f"no usable fit ({_number(clock.span, '.0f', ' s')} of data)"
+    offset = f"offset {_number(clock.offset, '.3f')} ± {_number(clock.offset_sigma, '.3f', ' s')}"
+    rate = "-" if clock.rate is None else f"{clock.rate * 1e6:.1f} ± {(clock.rate_sigma or 0.0) * 1e6:.1f} ppm"
+    p50, p99, most = (_number(value, ".3f") for value in (clock.delay_p50, clock.delay_p99, clock.delay_max))
+    late = "" if clock.delay_p50 is None else f"; arrival delay p50 {p50}, p99 {p99}, max {most} s"
+    return f"{offset}, rate {rate}, fitted to {clock.reference or 'arrival'}{late}"
+
+
+def _links(summary: Summary, console: Console) -> None:
+    if summary.accounts:
+        table = _table(
+            "Links",
+            "sender",
+            "vehicle>",
+            "received>",
+            "lost>",
+            "late>",
+            "duplicate>",
+            "conflicts>",
+            "ambiguous>",
+            "restarts>",
+            "loss>",
+        )
+        for a in summary.accounts:
+            loss = "not counted" if a.loss is None else f"{100 * a.loss:.2f} %"
+            table.add_row(
+                _plain(a.source),
+                str(a.vehicle),
+                *map(str, (a.received, a.lost, a.late, a.duplicate, a.conflict, a.ambiguous, a.restarted)),
+                loss,
+            )
+        console.print(table)
+    if summary.byte_accounts:
+        table = _table("Bytes", "link", "bytes>", "frames>", "unknown>", "corrupt>", "discarded bytes>", "pending>")
+        for b in summary.byte_accounts:
+            table.add_row(
+                _plain(b.source), *map(str, (b.bytes, b.frames, b.unknown, b.corrupt, b.discarded, b.pending))
+            )
+        console.print(table)
+    if summary.age is not None:
+        console.print(
+            f"  age of live estimates when recorded: p50 {summary.age.p50:.3f}, p99 {summary.age.p99:.3f}, "
+            f"max {summary.age.max:.3f} s",
+            highlight=False,
+        )
+
+
+def _windows(summary: Summary) -> Table:
+    scopes = ", ".join(sorted({w.scope for w in summary.windows}))
+    table = _table(
+        "Windows, smoothed with "
+        + {"window": "everything up to their closing", "sortie": "the whole boot epoch"}.get(scopes, scopes),
+        "window",
+        "test point",
+        "from",
+        "length>",
+        "closed by",
+        "samples>",
+        "late>",
+        "NIS/dof>",
+        "innovations",
+        "sigma altitude, median / max>",
+        "horizontal>",
+    )
+    several = len({w.vehicle for w in summary.windows}) > 1
+    for w in summary.windows:
+        name = f"{f'v{w.vehicle} ' if several else ''}{w.boot}.{w.number}"
+        ratio = f"{w.nis / w.dof:.2f}" if w.nis is not None and w.dof else "-"
+        sigma = [
+            "-" if median is None or most is None else f"{median:.2f} / {most:.2f} m"
+            for median, most in (
+                (w.median_sigma_altitude, w.max_sigma_altitude),
+                (w.median_sigma_horizontal, w.max_sigma_horizontal),
+            )
+        ]
+        table.add_row(
+            name,
+            _plain(w.test_point) or "-",
+            utc(w.t0, date=False),
+            duration((w.t1 - w.t0) / 1e9),
+            w.reason,
+            str(sum(w.measurements.values())),
+            str(sum(w.late.values())),
+            ratio,
+            verdict(w.nis, w.dof),
+            *sigma,
+        )
+    return table
+
+
+def _events(review: Review, console: Console) -> None:
+    counts = review.summary.events
+    if not counts:
+        return
+    levels = sorted(counts, key=lambda level: _LEVELS.index(level) if level in _LEVELS else len(_LEVELS))
+    console.print(
+        "[bold]Events[/bold]: " + ", ".join(f"{counts[level]} {level.lower()}" for level in levels), highlight=False
+    )
+    for line in review.log[:LINES]:
+        console.print(
+            f"  {utc(line.t, date=False)} {line.level:8} {_plain(line.text)}",
+            style=_COLOURS.get(line.level),
+            highlight=False,
+        )
+    if len(review.log) > LINES:
+        console.print(f"  ... and {len(review.log) - LINES} more in the recording", style="dim")
