@@ -369,7 +369,7 @@ def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED) -> None:
     import sims.accuracy
     from sims.transmitter import free_port
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, soft_wrap=True)
     name, folder = new_folder(
         datetime.now(UTC).strftime("demo-%Y%m%d-%H%M%S") if folder is None else folder.name, folder
     )

@@ -222,6 +222,7 @@ def record_folder(messages: Iterable[Message], folder: Path, name: str, properti
         windows=folder / "windows.rrd",
         sortie=name,
         properties=properties,
+        interval=0.25,  # every chunk costs a kilobyte, and a viewer shows no more than this
         on_alarm=lambda text: say(f"ALARM: {text}"),
     )
     (folder / "report.json").write_bytes(msgspec.json.format(msgspec.json.encode(summary)))

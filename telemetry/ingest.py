@@ -208,7 +208,7 @@ class _Ingest:
             yield from self._accounts.drain(self._links, lambda _: 0)
             if final or self._reached - self._bytes_told >= BYTES_ROW:
                 self._bytes_told = self._reached
-                for link in range(len(self._links)):
+                for link in np.flatnonzero(self._bytes[:, 0]).tolist():
                     yield self._account_of(link, now)
             yield Progress(vehicle=0, source=STAGE, boot=0, t=now, t_rx=now, final=final)
 

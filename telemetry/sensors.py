@@ -22,7 +22,7 @@ SEA_LEVEL_DENSITY = 1.225
 
 GNSS_SIGMA = 2.5  # m, horizontal, per axis, at HDOP 1 when the receiver states no accuracy
 GNSS_VELOCITY_SIGMA = 0.3  # m/s
-ALTIMETER_SIGMA = 0.7  # m
+ALTIMETER_SIGMA = 1.0  # m, of a MEMS barometer
 
 Columns = dict[str, NDArray[Any]]
 

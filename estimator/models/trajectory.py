@@ -76,7 +76,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     acceleration_vertical: float = 5.0
     altimeter_drift: float = 0.01
     gnss_correlation_time: float = 100.0
-    gnss_correlated_share: float = 0.9
+    gnss_correlated_share: float = 0.8
     prior_position: float = 1e4
     prior_velocity: float = 300.0
     prior_altimeter_bias: float = 500.0

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from estimator.geodesy import SEMI_MAJOR, SEMI_MINOR, TangentPlane, from_earth, to_earth
 from hypothesis import given
 from hypothesis import strategies as st
+
+from estimator.geodesy import SEMI_MAJOR, SEMI_MINOR, TangentPlane, from_earth, to_earth
 
 
 def test_known_points():

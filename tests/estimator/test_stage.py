@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
-from estimator.models.trajectory import NAMES
-from estimator.stage import Settings, estimate
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from estimator.models.trajectory import NAMES
+from estimator.stage import Settings, estimate
 from telemetry.messages import Altitude, Estimate, Event, Gnss, Mark, Message, Progress, Window
 
 S = 1_000_000_000
@@ -15,7 +18,7 @@ RADIUS = 6_378_137.0
 
 
 def flight(seconds=40.0, *, vehicle=1, boot=0, begin=1000.0, silence=(), seed=1) -> list[Message]:
-    """Single samples of a vehicle flying north at 20 m/s in the order of their arrival, a fix at 5 Hz and pressure at 10 Hz."""
+    """Single samples in the order of arrival: north at 20 m/s, fixes at 5 Hz, pressure at 10 Hz."""
     random = np.random.default_rng(seed)
     out: list[tuple[int, Message]] = []
     for i in range(int(10 * seconds)):
@@ -68,7 +71,7 @@ def run(messages, cuts=None, scope="window", options=None) -> list[Message]:
     messages = sorted(messages, key=lambda m: int(m.t_rx[0]))
     edges = sorted({0, len(messages), *(cuts or [])})
     stream: list[Message] = []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         stream += [*messages[a:b], progress(messages[:b], final=b == len(messages))]
     return list(estimate(stream, options or Settings(), scope=scope))
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
-from estimator.synchronise import Rows, Steps, Synchroniser
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from estimator.synchronise import Rows, Steps, Synchroniser
 
 MS = 1_000_000
 
@@ -119,7 +122,7 @@ def test_batches_do_not_change_the_steps(arrived, cuts):
     def run(edges):
         s = synchroniser(lag=150, grid=400)
         found = []
-        for a, b in zip(edges[:-1], edges[1:], strict=True):
+        for a, b in itertools.pairwise(edges):
             for t, t_rx, sensor in stream[a:b]:
                 if sensor == 3:
                     s.mark(t * MS, t_rx * MS)

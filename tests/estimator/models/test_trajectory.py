@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from estimator.models.trajectory import MEASUREMENTS, NAMES, SCALE, UNITS, M, N, P, Settings, Trajectory
 from hypothesis import given
 from hypothesis import strategies as st
+
+from estimator.models.trajectory import MEASUREMENTS, NAMES, SCALE, UNITS, M, N, P, Settings, Trajectory
 
 MODEL = Trajectory(0.8, 0.2, 500.0, Settings())
 

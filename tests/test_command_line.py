@@ -1,0 +1,241 @@
+"""What the command line answers to what users type: one line, and an exit code that a script can trust."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import sims
+from tests.console import RERUN, free_port, run
+from tests.telemetry.wire import DATA, Sender, tlog
+
+US = 1_700_000_000_000_000
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A flight of 40 s as a log."""
+    path = tmp_path_factory.mktemp("log") / "flight.tlog"
+    flight = sims.fly("c172x", "demo", duration=40, start_utc=US * 1000)
+    sims.write_tlog(sims.frames(flight), path, flight.start_utc)
+    return path
+
+
+def one_line(done: subprocess.CompletedProcess[str]) -> str:
+    lines = [line for line in done.stderr.splitlines() if line.startswith("sortie: ")]
+    assert len(lines) == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    return lines[0]
+
+
+def test_help_loads_nothing_heavy():
+    loaded = "('numpy', 'numba', 'rerun', 'zenoh', 'pymavlink', 'jsbsim', 'matplotlib', 'pyarrow')"
+    heavy = (
+        "import sys, sortie\ntry: sortie.app(['--help'])\nexcept SystemExit: pass\n"
+        f"print([m for m in {loaded} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", heavy], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    "command", ["demo", "live", "ingest", "estimate", "record", "smooth", "review", "replay", "sim", "verify", "bench"]
+)
+def test_every_command_explains_itself(command):
+    done = run(command, "--help")
+    assert done.returncode == 0
+    assert "Usage: sortie" in done.stdout
+
+
+def test_smooth_review_and_plot(log, tmp_path):
+    done = run("smooth", log, "-o", "out.rrd", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("out.rrd: 1 vehicle, ")
+    assert done.stdout.strip().endswith("complete")
+    assert subprocess.run([RERUN, "rrd", "verify", tmp_path / "out.rrd"], check=False).returncode == 0
+    told = run("review", "out.rrd", "--plot", "out.png", cwd=tmp_path)
+    assert told.returncode == 0, told.stderr
+    assert "complete" in told.stdout
+    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads(run("review", "out.rrd", "--json", cwd=tmp_path).stdout)
+    assert found["closed"]
+    assert [w["reason"] for w in found["summary"]["windows"]] == ["mark", "end"]
+
+
+def test_the_output_is_never_overwritten(log, tmp_path):
+    (tmp_path / "out.rrd").write_text("mine")
+    done = run("smooth", log, "-o", "out.rrd", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "out.rrd exists and a recording is never overwritten" in one_line(done)
+    assert (tmp_path / "out.rrd").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("none.tlog", None, "none.tlog: no such file or directory"),
+        ("empty.tlog", b"", "empty.tlog is empty: nothing was recorded"),
+        (
+            "text.tlog",
+            b"To whom it may concern\n" * 100,
+            "text.tlog is no telemetry log: no MAVLink frame in its first 2300 bytes",
+        ),
+        ("folder", "folder", "folder is no sortie folder: it has no sortie.toml"),
+    ],
+)
+def test_what_is_no_log_is_named(name, content, words, tmp_path):
+    if content == "folder":
+        (tmp_path / name).mkdir()
+    elif content is not None:
+        (tmp_path / name).write_bytes(content)
+    done = run("smooth", name, cwd=tmp_path)
+    assert done.returncode == 1
+    assert words in one_line(done)
+    assert not list(tmp_path.glob("*.rrd"))
+
+
+def test_an_output_folder_that_is_not_there_is_named(log, tmp_path):
+    done = run("smooth", log, "-o", tmp_path / "no" / "out.rrd")
+    assert done.returncode == 1
+    assert str(tmp_path / "no") in one_line(done)
+
+
+def test_a_log_cut_inside_a_frame_is_used_to_its_last_good_byte(log, tmp_path):
+    (tmp_path / "cut.tlog").write_bytes(log.read_bytes()[:-7])
+    done = run("smooth", "cut.tlog", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "truncated: the log ends inside a record" in done.stdout
+    told = run("review", "cut.rrd", cwd=tmp_path).stdout
+    assert "truncated" in told
+    assert "bytes are left out" in " ".join(told.split())
+
+
+def test_garbage_between_frames_is_counted_and_the_rest_used(log, tmp_path):
+    whole = log.read_bytes()
+    noise = np.random.default_rng(2).integers(0, 256, 5000, dtype=np.uint8).tobytes()
+    (tmp_path / "hurt.tlog").write_bytes(whole[:30_000] + noise + whole[30_000:])
+    done = run("smooth", "hurt.tlog", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "damaged: 5" in done.stdout
+    found = json.loads(run("review", "hurt.rrd", "--json", cwd=tmp_path).stdout)
+    assert 5000 <= sum(b["discarded"] for b in found["summary"]["byte_accounts"]) < 5200
+    assert sum(a["received"] for a in found["summary"]["accounts"]) > 3000
+
+
+def test_a_log_without_a_fix_is_recorded_and_said(tmp_path):
+    sender = Sender()
+    (tmp_path / "blind.tlog").write_bytes(
+        tlog([(US + 100_000 * i, sender.pressure(1000 + 100 * i, 900)) for i in range(100)])
+    )
+    done = run("smooth", "blind.tlog", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "no satellite fix, so there is nothing to smooth; what could be read is in blind.rrd" in one_line(done)
+    found = json.loads(run("review", "blind.rrd", "--json", cwd=tmp_path).stdout)
+    assert [s["samples"] for s in found["summary"]["vehicles"][0]["sensors"]] == [100]
+
+
+def test_unknown_ids_are_counted_and_harm_nothing(tmp_path):
+    sender = Sender()
+    frames = []
+    for i in range(100):
+        frames += [
+            (US + 200_000 * i, sender.gps(1000 + 200 * i, 48.0, 11.0, 500.0)),
+            (US + 200_000 * i + 5, sender.unknown()),
+        ]
+    (tmp_path / "odd.tlog").write_bytes(tlog(frames))
+    done = run("smooth", "odd.tlog", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(run("review", "odd.rrd", "--json", cwd=tmp_path).stdout)
+    assert sum(b["unknown"] for b in found["summary"]["byte_accounts"]) == 100
+    assert sum(a["lost"] for a in found["summary"]["accounts"]) == 0
+
+
+def test_a_busy_port_leaves_nothing_behind(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        done = run("live", f"udpin:127.0.0.1:{port}", "--folder", "here", cwd=tmp_path)
+    assert done.returncode == 1
+    assert f"udpin:127.0.0.1:{port}: the port is in use" in one_line(done)
+    assert not list((tmp_path / "here").iterdir())
+
+
+def test_a_sortie_is_never_overwritten(tmp_path):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "raw.tlog").write_text("evidence")
+    done = run("live", f"udpin:{free_port()}", "--folder", "here", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "here exists and is not empty" in one_line(done)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["frobnicate"], "Unknown command"),
+        (["smooth"], "requires an argument"),
+        (["smooth", "a.tlog", "--windw", "3"], "Unknown option"),
+        (["sim", "--to", "udpout:1", "--speed", "fast"], "Invalid value"),
+    ],
+)
+def test_wrong_usage_is_exit_code_two(arguments, words):
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert words in one_line(done)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["live"], "say where telemetry comes from"),
+        (["live", "tcp:1"], "'tcp:1' is no endpoint"),
+        (["sim", "zeppelin", "--to", "udpout:14550"], "zeppelin"),
+        (["review", "none.rrd"], "none.rrd: no such recording"),
+        (["verify", "."], "is no sortie folder"),
+    ],
+)
+def test_what_cannot_be_done_is_exit_code_one(arguments, words, tmp_path):
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == 1
+    assert words in one_line(done)
+
+
+def test_settings_come_from_a_file_and_mistakes_in_it_are_named(log, tmp_path):
+    (tmp_path / "good.toml").write_text("[estimate]\nwindow = 5\n[estimate.trajectory]\ngnss_correlated_share = 0.5\n")
+    (tmp_path / "bad.toml").write_text("[estimate]\nwindow = 'long'\n")
+    assert run("smooth", log, "-o", "a.rrd", "--config", "good.toml", cwd=tmp_path).returncode == 0
+    reasons = [
+        w["reason"] for w in json.loads(run("review", "a.rrd", "--json", cwd=tmp_path).stdout)["summary"]["windows"]
+    ]
+    assert "length" in reasons
+    done = run("smooth", log, "-o", "b.rrd", "--config", "bad.toml", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "bad.toml: Expected `float`, got `str` - at `$.estimate.window`" in one_line(done)
+
+
+@pytest.mark.parametrize(
+    ("name", "boots"), [("copter_2015_4reboots.tlog", 5), ("sitl_quadplane_uavlogviewer_vtol.tlog", 1)]
+)
+def test_real_logs(name, boots, tmp_path):
+    if not (DATA / name).exists():
+        pytest.skip(f"{DATA / name} is not here")
+    done = run("smooth", DATA / name, "-o", "out.rrd", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert subprocess.run([RERUN, "rrd", "verify", tmp_path / "out.rrd"], check=False).returncode == 0
+    summary = json.loads(run("review", "out.rrd", "--json", cwd=tmp_path).stdout)["summary"]
+    assert len(summary["vehicles"][0]["boots"]) == boots
+    windows = summary["windows"]
+    assert {w["boot"] for w in windows} == set(range(boots))
+    assert [w["reason"] for w in windows].count("reboot") == boots - 1
+    spans = sorted((b["t0"], b["t1"]) for b in summary["vehicles"][0]["boots"])
+    assert all(any(t0 <= w["t0"] and w["t1"] <= t1 for t0, t1 in spans) for w in windows), "no window across a boot"
+
+
+def test_bench_says_where_the_time_goes(log):
+    done = run("bench", "smooth", log)
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines()[1:]] == ["read", "decode", "estimate", "write", "all"]
