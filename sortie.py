@@ -1,10 +1,12 @@
 """The front door: one command line over the four rooms.
 
-Nothing heavy is imported before a command needs it, so that ``sortie --help`` answers at once.
+A command is a function; its docstring is its help. Nothing is imported before a command needs it, not even the library
+that reads the command line, so that ``sortie --help`` answers at once.
 """
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 import threading
@@ -14,8 +16,6 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import App, CycloptsError, Parameter
 
 from wiring import (
     DISTRIBUTION,
@@ -40,17 +40,7 @@ BUS = "tcp/127.0.0.1:7447"
 DEMO_FAULTS = "loss=0.005,outage=100:6"
 DEMO_SPEED = 8.0
 
-app = App(
-    name="sortie",
-    help="Turn the telemetry of a test flight into a trustworthy flight path while the aircraft still flies.",
-    help_format="plaintext",
-    version=lambda: version(DISTRIBUTION),
-)
-bench = App(name="bench", help="Measure speed.", help_format="plaintext")
-app.command(bench)
 
-
-@app.command
 def live(
     *endpoint: str,
     sortie: str | None = None,
@@ -93,7 +83,6 @@ def live(
         raise Failure(f"nothing was received on {', '.join(endpoint)}")
 
 
-@app.command
 def ingest(
     *endpoint: str, sortie: str, folder: Path, listen: str = BUS, config: Path | None = None, idle: float | None = None
 ) -> None:
@@ -137,7 +126,6 @@ def ingest(
             raise Failure("a consumer on the bus had not processed everything in time; the raw log is whole")
 
 
-@app.command
 def estimate(*, sortie: str, connect: str = BUS, config: Path | None = None) -> None:
     """The second of three processes: samples to estimates and windows.
 
@@ -162,7 +150,6 @@ def estimate(*, sortie: str, connect: str = BUS, config: Path | None = None) -> 
         serve(bus, "estimate", ["ingest"], partial(estimator.stage.estimate, settings=configuration.estimate))
 
 
-@app.command
 def record(folder: Path, *, sortie: str, connect: str = BUS) -> None:
     """The third of three processes: write the recording.
 
@@ -186,14 +173,7 @@ def record(folder: Path, *, sortie: str, connect: str = BUS) -> None:
         subscription.close()
 
 
-@app.command
-def smooth(
-    log: Path,
-    *,
-    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None,
-    config: Path | None = None,
-    quiet: bool = False,
-) -> None:
+def smooth(log: Path, *, output: Path | None = None, config: Path | None = None, quiet: bool = False) -> None:
     """Smooth a log, each boot as a whole, into one recording.
 
     Parameters
@@ -218,7 +198,6 @@ def smooth(
         raise Failure(f"{log}: no satellite fix, so there is nothing to smooth; what could be read is in {output}")
 
 
-@app.command
 def review(recording: Path, *, json: bool = False, plot: Path | None = None) -> None:
     """Read a recording or a sortie folder back: what flew, what was lost, each window and why it closed.
 
@@ -250,7 +229,6 @@ def review(recording: Path, *, json: bool = False, plot: Path | None = None) -> 
             print(f"picture: {plot}")
 
 
-@app.command
 def verify(folder: Path) -> None:
     """Prove that live equals replay: process the raw log of a sortie again and compare with its recording, bit for bit.
 
@@ -287,7 +265,6 @@ def verify(folder: Path) -> None:
     print(f"{folder}: live equals replay, bit for bit: {counts['estimates']} estimates, {counts['windows']} windows")
 
 
-@app.command
 def replay(log: Path, *, to: str, speed: float = 1.0, faults: str | None = None) -> None:
     """Send a log over UDP as it was received.
 
@@ -310,7 +287,6 @@ def replay(log: Path, *, to: str, speed: float = 1.0, faults: str | None = None)
     print(f"{counted(sent.datagrams, 'frame')} to {to} in {sent.took:.1f} s")
 
 
-@app.command
 def sim(
     aircraft: str = "c172x",
     *,
@@ -352,7 +328,6 @@ def sim(
     print(f"{sent.flown:.1f} s of flight, {counted(sent.datagrams, 'frame')} to {to} in {sent.took:.1f} s")
 
 
-@app.command
 def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED) -> None:
     """Fly a simulated aircraft, record and smooth it live, and compare everything with the truth.
 
@@ -415,7 +390,6 @@ def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED) -> None:
     console.print(f"picture:    {folder / 'smoothed.png'}", soft_wrap=True)
 
 
-@bench.command(name="smooth")
 def bench_smooth(log: Path | None = None) -> None:
     """Where the time of a smoothing goes: read, decode, estimate, write.
 
@@ -469,13 +443,49 @@ def bench_smooth(log: Path | None = None) -> None:
     print(f"  {'all':9} {total:7.3f} s  100.0 %  {frames / total / 1e3:8.0f} k frames/s")
 
 
+COMMANDS = (demo, live, smooth, review, verify, replay, sim, ingest, estimate, record)
+BENCHMARKS = {"smooth": bench_smooth}
+PURPOSE = "Turn the telemetry of a test flight into a trustworthy flight path while the aircraft still flies."
+
+
+def _overview() -> str:
+    """The help of the whole command line."""
+    lines = ["Usage: sortie COMMAND", "", PURPOSE, "", "Commands:"]
+    about = [(command.__name__, inspect.getdoc(command) or "") for command in COMMANDS]
+    about += [(f"bench {name}", inspect.getdoc(command) or "") for name, command in BENCHMARKS.items()]
+    lines += [f"  {name:13} {text.splitlines()[0]}" for name, text in about]
+    lines += [
+        "",
+        "sortie COMMAND --help explains a command; --version tells the version; --debug shows where an error arose.",
+    ]
+    return "\n".join(lines)
+
+
+def _application() -> Any:
+    from cyclopts import App, Parameter
+
+    app = App(name="sortie", help=PURPOSE, help_format="plaintext", version=lambda: version(DISTRIBUTION))
+    smooth.__annotations__["output"] = Annotated[Path | None, Parameter(name=["--output", "-o"])]
+    for command in COMMANDS:
+        app.command(command)
+    bench = App(name="bench", help="Measure speed.", help_format="plaintext")
+    for name, command in BENCHMARKS.items():
+        bench.command(command, name=name)
+    app.command(bench)
+    return app
+
+
 def main() -> None:
     """Run the command line: exit code 0 when the work is done, 1 when it failed, 2 when it was asked for wrongly."""
     arguments = sys.argv[1:]
+    if not arguments or arguments[0] in ("--help", "-h"):
+        print(_overview())
+        return
     debug = "--debug" in arguments
-    arguments = [argument for argument in arguments if argument != "--debug"]
+    from cyclopts import CycloptsError
+
     try:
-        app(arguments, exit_on_error=False, print_error=False)
+        _application()([a for a in arguments if a != "--debug"], exit_on_error=False, print_error=False)
     except CycloptsError as error:
         say(f"sortie: {' '.join(str(error).split())} (see sortie --help)")
         sys.exit(2)
