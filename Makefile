@@ -16,8 +16,8 @@ $(READY): pyproject.toml requirements.lock
 	    uv pip install --quiet --python $(BIN)/python --no-deps -e . ; \
 	else \
 	    $(PYTHON) -m venv $(VENV) && \
-	    $(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock && \
-	    $(BIN)/pip install --quiet --disable-pip-version-check --no-deps -e . ; \
+	    $(BIN)/pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock && \
+	    $(BIN)/pip install -qq --disable-pip-version-check --no-deps -e . ; \
 	fi
 	@touch $@
 

@@ -11,7 +11,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -224,7 +224,7 @@ def review(recording: Path, *, json: bool = False, plot: Path | None = None) -> 
     if json:
         print(msgspec.json.format(msgspec.json.encode(found)).decode())
     else:
-        tell(found, Console())
+        tell(found, Console(soft_wrap=True))
         if plot:
             print(f"picture: {plot}")
 
@@ -443,8 +443,8 @@ def bench_smooth(log: Path | None = None) -> None:
     print(f"  {'all':9} {total:7.3f} s  100.0 %  {frames / total / 1e3:8.0f} k frames/s")
 
 
-COMMANDS = (demo, live, smooth, review, verify, replay, sim, ingest, estimate, record)
-BENCHMARKS = {"smooth": bench_smooth}
+COMMANDS: tuple[Callable[..., None], ...] = (demo, live, smooth, review, verify, replay, sim, ingest, estimate, record)
+BENCHMARKS: dict[str, Callable[..., None]] = {"smooth": bench_smooth}
 PURPOSE = "Turn the telemetry of a test flight into a trustworthy flight path while the aircraft still flies."
 
 

@@ -228,9 +228,9 @@ def _scan_datagrams(data, bounds, extra, table, rows, known, junk, corrupt):  # 
 
 @njit(cache=True, nogil=True)
 def _time_at(data, i):  # type: ignore[no-untyped-def]
-    t = np.int64(0)
+    t = 0
     for k in range(8):
-        t = t << 8 | np.int64(data[i + k])
+        t = t << 8 | int(data[i + k])
     return t
 
 
@@ -257,11 +257,11 @@ def _scan_tlog(data, final, aligned, last, extra, table, rows, known, junk, corr
             for k in range(len(mark)):
                 same = same and data[i + 8 + k] == mark[k]
             if same:
-                size = np.int64(data[i + 13]) | np.int64(data[i + 14]) << 8
+                size = int(data[i + 13]) | int(data[i + 14]) << 8
                 if i + 15 + size <= n:
                     t = _time_at(data, i)
                     if 0 <= t < LATEST:
-                        last = t  # type: ignore[assignment]
+                        last = t
                     junk[runs, 0], junk[runs, 1], junk[runs, 2] = i + 15, size, last
                     status, length, msgid = _frame_at(data, i + 15, i + 15 + size, extra, table)
                     corrupt[runs] = status == _CORRUPT or (status == _SHORT and length > 0)

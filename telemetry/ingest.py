@@ -212,7 +212,6 @@ class _Ingest:
                     yield self._account_of(link, now)
             yield Progress(vehicle=0, source=STAGE, boot=0, t=now, t_rx=now, final=final)
 
-
     def _account_of(self, link: int, now: NDArray[np.int64]) -> LinkBytes:
         names = ("bytes", "frames", "unknown", "corrupt", "discarded", "pending")
         columns: dict[str, Any] = {name: self._bytes[link, i : i + 1].copy() for i, name in enumerate(names)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -52,7 +53,7 @@ def tell(review: Review, console: Console) -> None:
         _vehicle(vehicle, console)
     _links(summary, console)
     if summary.windows:
-        console.print(_windows(summary))
+        _windows(summary, console)
     _events(review, console)
 
 
@@ -74,10 +75,10 @@ def _table(title: str, *columns: str) -> Table:
     from rich import box
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in columns:
         name, _, side = column.partition(">")
-        table.add_column(name, justify="right" if side == "" and column.endswith(">") else "left")
+        table.add_column(name, justify="right" if side == "" and column.endswith(">") else "left", no_wrap=True)
     return table
 
 
@@ -140,28 +141,20 @@ def _clock(clock: Clock) -> str:
 
 def _links(summary: Summary, console: Console) -> None:
     if summary.accounts:
-        table = _table(
-            "Links",
-            "sender",
-            "vehicle>",
-            "received>",
-            "lost>",
-            "late>",
-            "duplicate>",
-            "conflicts>",
-            "ambiguous>",
-            "restarts>",
-            "loss>",
-        )
+        table = _table("Links", "sender", "vehicle>", "received>", "lost>", "late>", "duplicate>", "restarts>", "loss>")
+        notes = []
         for a in summary.accounts:
             loss = "not counted" if a.loss is None else f"{100 * a.loss:.2f} %"
-            table.add_row(
-                _plain(a.source),
-                str(a.vehicle),
-                *map(str, (a.received, a.lost, a.late, a.duplicate, a.conflict, a.ambiguous, a.restarted)),
-                loss,
-            )
+            counts = (a.vehicle, a.received, a.lost, a.late, a.duplicate, a.restarted)
+            table.add_row(_plain(a.source), *map(str, counts), loss)
+            who = f"  {a.source} of vehicle {a.vehicle}:"
+            if a.ambiguous:
+                notes.append(f"{who} {a.ambiguous} lost in holes too long for an 8-bit counter to tell their length")
+            if a.conflict:
+                notes.append(f"{who} {a.conflict} frames bore the number of another frame")
         console.print(table)
+        for note in notes:
+            console.print(note, highlight=False, markup=False)
     if summary.byte_accounts:
         table = _table("Bytes", "link", "bytes>", "frames>", "unknown>", "corrupt>", "discarded bytes>", "pending>")
         for b in summary.byte_accounts:
@@ -177,47 +170,31 @@ def _links(summary: Summary, console: Console) -> None:
         )
 
 
-def _windows(summary: Summary) -> Table:
+def _windows(summary: Summary, console: Console) -> None:
     scopes = ", ".join(sorted({w.scope for w in summary.windows}))
-    table = _table(
-        "Windows, smoothed with "
-        + {"window": "everything up to their closing", "sortie": "the whole boot epoch"}.get(scopes, scopes),
-        "window",
-        "test point",
-        "from",
-        "length>",
-        "closed by",
-        "samples>",
-        "late>",
-        "NIS/dof>",
-        "innovations",
-        "sigma altitude, median / max>",
-        "horizontal>",
-    )
+    known = {"window": "everything up to their closing", "sortie": "the whole boot epoch"}.get(scopes, scopes)
+    columns = "window", "test point", "from", "length>", "closed", "NIS/dof>", "altitude>", "horiz.>"
+    table = _table(f"Windows, smoothed with {known}", *columns)
     several = len({w.vehicle for w in summary.windows}) > 1
     for w in summary.windows:
-        name = f"{f'v{w.vehicle} ' if several else ''}{w.boot}.{w.number}"
-        ratio = f"{w.nis / w.dof:.2f}" if w.nis is not None and w.dof else "-"
-        sigma = [
-            "-" if median is None or most is None else f"{median:.2f} / {most:.2f} m"
-            for median, most in (
-                (w.median_sigma_altitude, w.max_sigma_altitude),
-                (w.median_sigma_horizontal, w.max_sigma_horizontal),
-            )
-        ]
         table.add_row(
-            name,
+            f"{f'v{w.vehicle} ' if several else ''}{w.boot}.{w.number}",
             _plain(w.test_point) or "-",
             utc(w.t0, date=False),
             duration((w.t1 - w.t0) / 1e9),
             w.reason,
-            str(sum(w.measurements.values())),
-            str(sum(w.late.values())),
-            ratio,
-            verdict(w.nis, w.dof),
-            *sigma,
+            f"{w.nis / w.dof:.2f}" if w.nis is not None and w.dof else "-",
+            _number(w.median_sigma_altitude, ".2f", " m"),
+            _number(w.median_sigma_horizontal, ".2f", " m"),
         )
-    return table
+    console.print(table)
+    verdicts = Counter(verdict(w.nis, w.dof) for w in summary.windows)
+    innovations = ", ".join(f"{count} {word}" for word, count in verdicts.most_common())
+    console.print("  altitude, horiz.: median standard deviations; NIS/dof is 1 if the model is right", highlight=False)
+    console.print(f"  innovations: {innovations}", highlight=False)
+    late = sum(sum(w.late.values()) for w in summary.windows)
+    if late:
+        console.print(f"  {late} samples came too late for the estimate", highlight=False, style="yellow")
 
 
 def _events(review: Review, console: Console) -> None:
