@@ -435,7 +435,7 @@ def bench_smooth(log: Path | None = None) -> None:
         "estimate": spent["estimate"] - spent["decode"],
         "write": total - spent["estimate"],
     }
-    frames = sum(account.received for account in summary.accounts)
+    frames = sum(account.frames for account in summary.byte_accounts)
     print(f"{log.name}: {size / 1e6:.1f} MB, {frames} frames -> {written / 1e6:.1f} MB, second run in one process")
     for stage, seconds in own.items():
         rate = frames / max(seconds, 1e-9) / 1e3
