@@ -122,6 +122,7 @@ def ingest(
         stop_on_signals(source.stop)
         say(f"{name}: listening on {', '.join(endpoint)}, bus on {listen}")
         messages = telemetry.ingest.ingest(source.batches(idle), source.links, dialect, configuration.ingest)
+        messages = telemetry.ingest.guarded(messages, raw_log, lambda: source.dropped)
         if not publish(bus, "ingest", watch(messages, say)):
             raise Failure("a consumer on the bus had not processed everything in time; the raw log is whole")
 

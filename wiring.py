@@ -259,7 +259,7 @@ def follow(
     from estimator.stage import estimate
     from telemetry.archive import RawLog
     from telemetry.bus import Bus, publish, serve
-    from telemetry.ingest import ingest
+    from telemetry.ingest import guarded, ingest
     from telemetry.mavlink import Dialect
     from telemetry.sources.udp import UdpSource
 
@@ -280,18 +280,12 @@ def follow(
         stages.run(
             "estimate", lambda: serve(bus, "estimate", ["ingest"], partial(estimate, settings=configuration.estimate))
         )
-        stages.run(
-            "ingest",
-            lambda: publish(bus, "ingest", ingest(source.batches(idle), source.links, dialect, configuration.ingest)),
-        )
+        messages = ingest(source.batches(idle), source.links, dialect, configuration.ingest)
+        stages.run("ingest", lambda: publish(bus, "ingest", guarded(messages, raw_log, lambda: source.dropped)))
         ready()
 
         def received() -> Iterator[Message]:
-            alarm = None
             for message in subscription:
-                if raw_log.error != alarm:
-                    alarm = raw_log.error
-                    tell(f"ALARM: {alarm}" if alarm else "raw telemetry is being kept again")
                 if message is not None:
                     if keep:
                         keep(message)

@@ -8,7 +8,7 @@ how the stream was cut into batches.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telemetry import text
+from telemetry.archive import RawLog
 from telemetry.clock import NO_TIME, BootClock, Epochs
 from telemetry.clockfit import ClockFitter
 from telemetry.frames import LATEST, Frames, join, scan_datagrams
@@ -100,6 +101,32 @@ def warm_up(dialect: Dialect) -> None:
     )
     for _ in ingest([frames], ["0"], dialect):
         pass
+
+
+def guarded(messages: Iterable[Message], raw_log: RawLog, dropped: Callable[[], int]) -> Iterator[Message]:
+    """Pass on what is ingested live, and tell when evidence or samples are being lost.
+
+    Parameters
+    ----------
+    messages : iterable of Message
+    raw_log : RawLog
+        What keeps the evidence; its `error` is told when it appears and when it is over.
+    dropped : callable
+        Frames that were archived but not handed on, because ingest could not follow.
+    """
+    error: str | None = None
+    gone = 0
+    for message in messages:
+        yield message
+        now = int(message.t_rx[-1])
+        if raw_log.error != error:
+            error = raw_log.error
+            said = f"ALARM: {error}" if error else f"{raw_log.path}: raw telemetry is being kept again"
+            yield event(said, level="error" if error else "info", source=STAGE, t=now, t_rx=now)
+        if dropped() > gone:
+            said = f"ALARM: {dropped() - gone} frames are in the raw log only: ingest could not follow"
+            gone = dropped()
+            yield event(said, level="error", source=STAGE, t=now, t_rx=now)
 
 
 class _Ingest:

@@ -61,7 +61,7 @@ def test_written_through_at_least_once_a_second(tmp_path, monkeypatch):
     log.close()
 
 
-class _FullDisk:
+class FullDisk:
     """The log's file on a disk that has room for a few bytes more."""
 
     def __init__(self, file, room: int) -> None:
@@ -83,7 +83,7 @@ def test_a_full_disk_is_told_and_leaves_whole_records(tmp_path):
     log = RawLog(tmp_path / "raw.tlog")
     log.write(scan(sender.attitude(1)))
     whole = log._file
-    log._file = _FullDisk(whole, 10)
+    log._file = FullDisk(whole, 10)
     log.write(scan(sender.attitude(2)))
     assert "No space left on device" in log.error
     assert log.lost > 0

@@ -10,8 +10,11 @@ import pytest
 
 from telemetry.archive import RawLog
 from telemetry.frames import join
+from telemetry.ingest import guarded, ingest
 from telemetry.mavlink import Dialect
+from telemetry.messages import Attitude, Event
 from telemetry.sources.udp import UdpSource, parse_endpoint
+from tests.telemetry.test_archive import FullDisk
 from tests.telemetry.test_frames import frames_of, read
 from tests.telemetry.wire import Sender
 
@@ -80,6 +83,31 @@ def test_stop_hands_out_what_was_received_and_frees_the_port(port):
     assert sum(len(batch) for batch in source.batches()) == 1
     assert time.monotonic() - begin < 5
     UdpSource([endpoint], DIALECT).stop()
+
+
+def test_a_full_disk_raises_an_alarm_and_the_samples_go_on(port, tmp_path):
+    raw_log = RawLog(tmp_path / "raw.tlog")
+    whole = raw_log._file
+    raw_log._file = FullDisk(whole, 100)
+    source = UdpSource([f"udpin:127.0.0.1:{port}"], DIALECT, raw_log)
+    sender = Sender()
+
+    def send():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            for i in range(40):
+                if i == 20:
+                    raw_log._file = whole
+                sock.sendto(sender.attitude(1000 + 20 * i), ("127.0.0.1", port))
+                time.sleep(0.02)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    messages = list(guarded(ingest(source.batches(idle=0.5), ["0"], DIALECT), raw_log, lambda: source.dropped))
+    thread.join()
+    told = [text for m in messages if isinstance(m, Event) for text in m.text]
+    assert any("ALARM" in text and "No space left on device" in text for text in told)
+    assert any("raw telemetry is being kept again" in text for text in told)
+    assert sum(len(m.t) for m in messages if isinstance(m, Attitude)) == 40
 
 
 def test_links_are_numbered_by_endpoint(port):
