@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from estimator.information import Carry, Filtered, InformationFilter
-    from estimator.linear import LinearModel, Smoothed, smooth
+    from estimator.linear import Smoothed, smooth
+    from estimator.model import LinearModel
     from estimator.smoother import Unobservable
     from estimator.snapshots import Store
     from estimator.window import Rule
@@ -39,7 +40,7 @@ _HOME = {
     "Carry": "information",
     "Filtered": "information",
     "InformationFilter": "information",
-    "LinearModel": "linear",
+    "LinearModel": "model",
     "Rule": "window",
     "Smoothed": "linear",
     "Store": "snapshots",

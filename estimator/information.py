@@ -15,18 +15,16 @@ A streaming stage::
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator import sweeps
+from estimator.model import LinearModel
 from estimator.snapshots import Store, rows
 from estimator.ud import Array
 from estimator.window import Rule
-
-if TYPE_CHECKING:
-    from estimator.linear import LinearModel
 
 RULE = Rule()
 

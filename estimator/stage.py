@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.information import Carry, anchor, filter, start
-from estimator.linear import LinearModel
+from estimator.model import LinearModel
 from estimator.models import trajectory
 from estimator.models.trajectory import Trajectory
 from estimator.smoother import backward

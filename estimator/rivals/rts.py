@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from estimator.linear import LinearModel, Smoothed
+from estimator.linear import Smoothed
+from estimator.model import LinearModel
 from estimator.ud import Array, compiled
 
 DONE, UPDATE, PREDICTION = 0, 1, 2
