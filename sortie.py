@@ -25,7 +25,9 @@ from wiring import (
     follow,
     new_folder,
     open_log,
+    open_source,
     record_folder,
+    refuse_loss,
     say,
     smooth_log,
     stop_on_signals,
@@ -104,10 +106,8 @@ def ingest(
         Stop by itself after so many seconds without telemetry.
     """
     import telemetry.ingest
-    from telemetry.archive import RawLog
     from telemetry.bus import Bus, publish
     from telemetry.mavlink import Dialect
-    from telemetry.sources.udp import UdpSource
 
     if not endpoint:
         raise Failure("say where telemetry comes from, e.g. sortie ingest udpin:127.0.0.1:14550 --sortie S --folder F")
@@ -116,15 +116,19 @@ def ingest(
     dialect = Dialect(configuration.ingest.dialect)
     telemetry.ingest.warm_up(dialect)
     with Bus(name, listen=[listen]) as bus:
-        raw_log = RawLog(folder / "raw.tlog", links=len(endpoint))
-        source = UdpSource(endpoint, dialect, raw_log)
-        write_what_runs(folder, name, endpoint, configuration, dialect)
-        stop_on_signals(source.stop)
-        say(f"{name}: listening on {', '.join(endpoint)}, bus on {listen}")
-        messages = telemetry.ingest.ingest(source.batches(idle), source.links, dialect, configuration.ingest)
-        messages = telemetry.ingest.guarded(messages, raw_log, lambda: source.dropped)
-        if not publish(bus, "ingest", watch(messages, say)):
-            raise Failure("a consumer on the bus had not processed everything in time; the raw log is whole")
+        source, raw_log = open_source(endpoint, dialect, folder)
+        try:
+            write_what_runs(folder, name, endpoint, configuration, dialect)
+            stop_on_signals(source.stop)
+            say(f"{name}: listening on {', '.join(endpoint)}, bus on {listen}")
+            messages = telemetry.ingest.ingest(source.batches(idle), source.links, dialect, configuration.ingest)
+            messages = telemetry.ingest.guarded(messages, raw_log, lambda: source.dropped)
+            if not publish(bus, "ingest", watch(messages, say)):
+                raise Failure("a consumer on the bus had not processed everything in time; the raw log is whole")
+        finally:
+            source.stop()
+            source.join()
+    refuse_loss(raw_log)
 
 
 def estimate(*, sortie: str, connect: str = BUS, config: Path | None = None) -> None:
@@ -139,16 +143,18 @@ def estimate(*, sortie: str, connect: str = BUS, config: Path | None = None) -> 
     config
         TOML file with settings.
     """
-    from functools import partial
-
     import estimator.stage
-    from telemetry.bus import Bus, serve
+    from telemetry.bus import Bus, publish
 
     configuration = configure(config)
     estimator.stage.warm_up()
     with Bus(sortie, connect=[connect]) as bus:
+        subscription = bus.subscribe("estimate", ["ingest"])
+        stop_on_signals(subscription.stop)
         say(f"{sortie}: estimating on {connect}")
-        serve(bus, "estimate", ["ingest"], partial(estimator.stage.estimate, settings=configuration.estimate))
+        samples = (message for message in subscription if message is not None)
+        publish(bus, "estimate", estimator.stage.estimate(samples, configuration.estimate))
+        subscription.close()
 
 
 def record(folder: Path, *, sortie: str, connect: str = BUS) -> None:

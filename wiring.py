@@ -47,6 +47,7 @@ def configure(path: Path | None) -> Any:
 
     import estimator.stage
     import telemetry.ingest
+    from telemetry.text import check_mark
 
     kind = msgspec.defstruct(
         "Configuration",
@@ -60,9 +61,11 @@ def configure(path: Path | None) -> Any:
     if path is None:
         return kind()
     try:
-        return msgspec.toml.decode(path.read_bytes(), type=kind)
-    except msgspec.DecodeError as error:
+        configuration: Any = msgspec.toml.decode(path.read_bytes(), type=kind)
+        check_mark(configuration.ingest.mark)
+    except ValueError as error:  # msgspec's own are among them
         raise Failure(f"{path}: {error}") from None
+    return configuration
 
 
 def also(messages: Iterable[Message], stage: Callable[[Iterable[Message]], Iterable[Message]]) -> Iterator[Message]:
@@ -181,11 +184,16 @@ class _Stages:
         thread.start()
         self._threads.append(thread)
 
-    def join(self) -> None:
-        for thread in self._threads:
-            thread.join()
+    def check(self) -> None:
+        """Raise the first failure so far, if there is one."""
         if self.failures:
             raise self.failures[0]
+
+    def join(self) -> None:
+        """Wait for all, and raise their first failure."""
+        for thread in self._threads:
+            thread.join()
+        self.check()
 
 
 def stop_on_signals(stop: Callable[[], None]) -> None:
@@ -257,44 +265,68 @@ def follow(
     from functools import partial
 
     from estimator.stage import estimate
-    from telemetry.archive import RawLog
     from telemetry.bus import Bus, publish, serve
     from telemetry.ingest import guarded, ingest
     from telemetry.mavlink import Dialect
-    from telemetry.sources.udp import UdpSource
 
     dialect = Dialect(configuration.ingest.dialect)
     _warm_up(dialect)
+    source, raw_log = open_source(endpoints, dialect, folder)
+    stages = _Stages()
+    try:
+        write_what_runs(folder, name, endpoints, configuration, dialect)
+        stop_on_signals(source.stop)
+        with Bus(name) as bus:
+            subscription = bus.subscribe("record", ["ingest", "estimate"])
+            settings = configuration.estimate
+            stages.run("estimate", lambda: serve(bus, "estimate", ["ingest"], partial(estimate, settings=settings)))
+            messages = ingest(source.batches(idle), source.links, dialect, configuration.ingest)
+            stages.run("ingest", lambda: publish(bus, "ingest", guarded(messages, raw_log, lambda: source.dropped)))
+            ready()
+
+            def received() -> Iterator[Message]:
+                for message in subscription:
+                    if message is not None:
+                        if keep:
+                            keep(message)
+                        yield message
+
+            try:
+                summary = record_folder(watch(received(), tell), folder, name, {"endpoints": " ".join(endpoints)})
+                stages.check()
+            except Exception as error:  # what else may be broken, the evidence of the flight is not given up
+                tell(f"ALARM: {error or type(error).__name__}: only the raw log goes on; Ctrl-C ends it")
+                subscription.close()
+                for _ in source.batches(idle):
+                    pass
+                raise
+            subscription.close()
+            stages.join()
+    finally:
+        source.stop()
+        source.join()
+    refuse_loss(raw_log)
+    return summary
+
+
+def open_source(endpoints: Sequence[str], dialect: Any, folder: Path) -> tuple[Any, Any]:
+    """Listen to the endpoints, with the raw log of a sortie folder behind them; nothing is left if that fails."""
+    from telemetry.archive import RawLog
+    from telemetry.sources.udp import UdpSource
+
     raw_log = RawLog(folder / "raw.tlog", links=len(endpoints))
     try:
-        source = UdpSource(endpoints, dialect, raw_log)
+        return UdpSource(endpoints, dialect, raw_log), raw_log
     except BaseException:
         raw_log.close()
         raw_log.path.unlink()
         raise
-    write_what_runs(folder, name, endpoints, configuration, dialect)
-    stop_on_signals(source.stop)
-    stages = _Stages()
-    with Bus(name) as bus:
-        subscription = bus.subscribe("record", ["ingest", "estimate"])
-        stages.run(
-            "estimate", lambda: serve(bus, "estimate", ["ingest"], partial(estimate, settings=configuration.estimate))
-        )
-        messages = ingest(source.batches(idle), source.links, dialect, configuration.ingest)
-        stages.run("ingest", lambda: publish(bus, "ingest", guarded(messages, raw_log, lambda: source.dropped)))
-        ready()
 
-        def received() -> Iterator[Message]:
-            for message in subscription:
-                if message is not None:
-                    if keep:
-                        keep(message)
-                    yield message
 
-        summary = record_folder(watch(received(), tell), folder, name, {"endpoints": " ".join(endpoints)})
-        subscription.close()
-        stages.join()
-    return summary
+def refuse_loss(raw_log: Any) -> None:
+    """Fail if evidence was lost."""
+    if raw_log.lost:
+        raise Failure(f"{raw_log.path}: {raw_log.lost} bytes of raw telemetry could not be written and are lost")
 
 
 def smooth_log(

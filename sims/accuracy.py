@@ -61,8 +61,9 @@ class Accuracy:
     def figures(self) -> dict[str, dict[str, dict[str, float | None]]]:
         """Per source and quantity the rms error and the share of errors within two standard deviations.
 
-        A quantity that the source does not measure is missing; the mean standard deviation stands beside the error.
-        Errors are those of all components together; samples before the first complete estimate are left out.
+        A quantity that the source does not measure is missing; the rms of the stated standard deviations stands
+        beside the error. Errors are those of all components together; samples before the first complete estimate are
+        left out.
         """
         if self._offset is None:
             raise ValueError("no UTC was heard from the vehicle: its estimates cannot be placed beside the truth")

@@ -30,8 +30,8 @@ class RawLog:
     Attributes
     ----------
     error : str or None
-        Why the last write failed; None while all is well. A failed write loses its records but not the log: the file
-        is cut back to its last whole record and the next write tries again.
+        Why the last write failed; None when the last one succeeded. A failed write loses its records but not the log:
+        the file is cut back to its last whole record and the next write tries again.
     lost : int
         Bytes that could not be written.
     size : int

@@ -117,7 +117,6 @@ def guarded(messages: Iterable[Message], raw_log: RawLog, dropped: Callable[[], 
     error: str | None = None
     gone = 0
     for message in messages:
-        yield message
         now = int(message.t_rx[-1])
         if raw_log.error != error:
             error = raw_log.error
@@ -127,6 +126,7 @@ def guarded(messages: Iterable[Message], raw_log: RawLog, dropped: Callable[[], 
             said = f"ALARM: {dropped() - gone} frames are in the raw log only: ingest could not follow"
             gone = dropped()
             yield event(said, level="error", source=STAGE, t=now, t_rx=now)
+        yield message  # afterwards: a final word has nobody listening behind it
 
 
 class _Ingest:
@@ -172,32 +172,25 @@ class _Ingest:
         """Make receive time run forward: where the recorder's clock stepped back, what follows is moved up to it."""
         t_rx = frames.t_rx + self._shift
         said: list[Message] = []
-        until = frames.until + self._shift
-        before = np.concatenate([[self._received or (t_rx[0] if len(t_rx) else 0)], t_rx[:-1]])
-        for i in np.flatnonzero(t_rx < before - RECEIVE_STEP):
-            step = int(max(before[: i + 1].max(), self._received) - t_rx[i])
-            if step <= RECEIVE_STEP:
-                continue
-            t_rx[i:] += step
-            before[i + 1 :] += step
-            until += step
+        begin = self._received or (int(t_rx[0]) if len(t_rx) else 0)
+        while True:
+            newest = np.maximum.accumulate(np.concatenate([[begin], t_rx[:-1]])) if len(t_rx) else t_rx
+            back = np.flatnonzero(t_rx < newest - RECEIVE_STEP)
+            if not len(back):
+                break
+            at = int(back[0])
+            step = int(newest[at] - t_rx[at])
+            t_rx[at:] += step
             self._shift += step
-            said.append(
-                event(
-                    f"the receive clock stepped back by {step * 1e-9:.1f} s: what follows is dated from before",
-                    level="warning",
-                    source=STAGE,
-                    t=int(t_rx[i]),
-                    t_rx=int(t_rx[i]),
-                )
-            )
-        if len(t_rx):
-            t_rx = np.maximum.accumulate(np.maximum(t_rx, self._received))
-            self._received = int(t_rx[-1])
-        moved = self._shift or not np.array_equal(t_rx, frames.t_rx)
-        if moved:
+            now = int(t_rx[at])
+            text = f"the receive clock stepped back by {step * 1e-9:.1f} s: what follows is dated from before"
+            said.append(event(text, level="warning", source=STAGE, t=now, t_rx=now))
+        t_rx = np.maximum(t_rx, newest)
+        until = frames.until + self._shift
+        self._received = max(self._received, until, int(t_rx[-1]) if len(t_rx) else 0)
+        if self._shift or not np.array_equal(t_rx, frames.t_rx):
             columns = {name: getattr(frames, name) for name in frames.__dataclass_fields__}
-            frames = Frames(**(columns | {"t_rx": t_rx, "until": min(until, self._received)}))
+            frames = Frames(**(columns | {"t_rx": t_rx, "until": until}))
         return frames, said
 
     def _count(self, frames: Frames) -> None:
@@ -215,14 +208,16 @@ class _Ingest:
             )
 
     def _advance(self, frames: Frames | None, until: int, final: bool) -> Iterator[Message]:
-        present = set(np.unique(frames.sysid).tolist()) if frames is not None else set()
-        for sysid in sorted(present | {s for s, system in self._systems.items() if system.waits or final}):
+        verified = np.unique(frames.sysid[frames.known]).tolist() if frames is not None else []
+        for sysid in verified:
             if sysid not in self._systems:
                 self._systems[sysid] = _System(sysid, self._links, self._dialect, self._settings)
+        for sysid, system in sorted(self._systems.items()):
             new = None
-            if frames is not None and sysid in present:
-                new = frames if len(present) == 1 else frames.select(np.flatnonzero(frames.sysid == sysid))
-            yield from self._systems[sysid].feed(new, self._accounts, until, final)
+            if frames is not None and len(rows := np.flatnonzero(frames.sysid == sysid)):
+                new = frames if len(rows) == len(frames) else frames.select(rows)
+            if new is not None or system.waits or final or system.listens:
+                yield from system.feed(new, self._accounts, until, final)
         waiting = [system.waits for system in self._systems.values() if system.waits]
         covered = min([until, *(t - 1 for t in waiting)])
         self._reached = max(self._reached, covered)
@@ -259,16 +254,21 @@ class _System:
         self._times = _BootTimes(dialect)
         self._fitter = ClockFitter(sysid, STAGE)
         self._sensors: dict[tuple[int, int], Sensors] = {}
-        self._texts: dict[tuple[int, int], Texts] = {}
-        self._seen: set[int] = set()
+        self._texts: dict[int, Texts] = {}
+        self._seen: set[int] = set()  # components whose heartbeat has been told
+        self._heard: set[int] = set()  # components whose checksums are right
 
     def feed(self, new: Frames | None, accounts: LinkAccounts, until: int, final: bool) -> Iterator[Message]:
         parts = [part for part in (self._held, new) if part is not None]
-        if not parts:
-            if final:
-                yield from self._fits(final)
-            return
-        frames = join(parts)
+        if parts:
+            yield from self._place(join(parts), accounts, until, final)
+        yield from self._fits(final)
+        covered = min(until, self.waits - 1) if self.waits else until
+        for texts in self._texts.values():
+            yield from texts.expire(covered, final)
+
+    def _place(self, frames: Frames, accounts: LinkAccounts, until: int, final: bool) -> Iterator[Message]:
+        """Give the frames their place on the vehicle's clock, as far as it can be told, and decode those."""
         boot_time, modulus = self._times.read(frames)
         epochs = self.clock.feed(
             boot_time, frames.msgid.astype(np.int32), frames.t_rx, frames.seq, modulus, now=until, flush=final
@@ -280,52 +280,68 @@ class _System:
             return
         self._times.commit(frames.compid[:n][boot_time[:n] != NO_TIME])
         done = frames if n == len(frames) else frames.select(slice(0, n))
+        counted = self._verified(done)
         accounts.feed(
-            done.link,
-            done.sysid,
-            done.compid,
-            done.seq,
-            done.t_rx,
-            done.checksum(),
-            epochs.restarted,
-            epochs.timed & ~epochs.restarted,
+            done.link[counted],
+            done.sysid[counted],
+            done.compid[counted],
+            done.seq[counted],
+            done.t_rx[counted],
+            done.checksum()[counted],
+            epochs.restarted[counted],
+            (epochs.timed & ~epochs.restarted)[counted],
         )
         for row, said in epochs.events:
             yield self._event("warning", said, epochs, row, done)
         self._fitter.feed(epochs, done.t_rx, self._unix(done))
         for boot in np.unique(epochs.epoch).tolist():
             yield from self._decode(done, epochs, np.flatnonzero(epochs.epoch == boot), boot)
-        yield from self._fits(final)
+
+    @property
+    def listens(self) -> bool:
+        """Whether a text waits for its end."""
+        return any(texts.waits for texts in self._texts.values())
+
+    def _verified(self, frames: Frames) -> NDArray[np.bool_]:
+        """Frames that count: an unknown id proves nothing, so its sender must have been verified before."""
+        counted = frames.known.copy()
+        for i in np.flatnonzero(~counted).tolist():
+            same = frames.compid[:i] == frames.compid[i]
+            counted[i] = int(frames.compid[i]) in self._heard or bool((same & frames.known[:i]).any())
+        self._heard |= set(np.unique(frames.compid[frames.known]).tolist())
+        return counted
 
     def _decode(self, frames: Frames, epochs: Epochs, rows: NDArray[np.int64], boot: int) -> Iterator[Message]:
         known = rows[frames.known[rows]]
+        for row in known[frames.msgid[known] == HEARTBEAT].tolist():
+            compid = int(frames.compid[row])
+            if compid not in self._seen:
+                self._seen.add(compid)
+                (heartbeat,) = self._dialect.decode(frames, HEARTBEAT, np.array([row]))
+                said = f"system {self._sysid} component {compid}: {_describe(heartbeat)}"
+                yield self._event("info", said, epochs, row, frames)
         senders = frames.link[known].astype(np.int64) << 8 | frames.compid[known]
         for sender in np.unique(senders).tolist():
             link, compid = sender >> 8, sender & 255
             mine = known[senders == sender]
             msgids = frames.msgid[mine]
             decoded = {}
-            for msgid in _WANTED & set(np.unique(msgids).tolist()):
+            for msgid in _MEASURING & set(np.unique(msgids).tolist()):
                 which = mine[msgids == msgid]
                 decoded[msgid] = which, self._dialect.decode(frames, msgid, which)
-            source = f"{self._links[link]}/{compid}"
-            if HEARTBEAT in decoded and compid not in self._seen:
-                self._seen.add(compid)
-                first = decoded[HEARTBEAT][1][0]
-                yield self._event(
-                    "info",
-                    f"system {self._sysid} component {compid}: {_describe(first)}",
-                    epochs,
-                    int(decoded[HEARTBEAT][0][0]),
-                    frames,
-                )
             if (link, compid) not in self._sensors:
-                self._sensors[link, compid] = Sensors(self._sysid, source)
-                self._texts[link, compid] = Texts(self._sysid, source, self._settings.mark)
+                self._sensors[link, compid] = Sensors(self._sysid, f"{self._links[link]}/{compid}")
             yield from self._sensors[link, compid].samples(decoded, epochs.t, frames.t_rx, boot)
-            if text.MSGID in decoded:
-                which, values = decoded[text.MSGID]
-                yield from self._texts[link, compid].read(values, epochs.t[which], frames.t_rx[which], boot)
+        spoken = known[frames.msgid[known] == text.MSGID]
+        for compid in np.unique(frames.compid[spoken]).tolist():
+            mine = spoken[frames.compid[spoken] == compid]
+            if compid not in self._texts:
+                source = f"{self._links[int(frames.link[mine[0]])]}/{compid}"
+                self._texts[compid] = Texts(self._sysid, source, self._settings.mark)
+            values = self._dialect.decode(frames, text.MSGID, mine)
+            yield from self._texts[compid].read(
+                values, frames.seq[mine], frames.link[mine], epochs.t[mine], frames.t_rx[mine], boot
+            )
 
     def _unix(self, frames: Frames) -> NDArray[np.int64]:
         """UTC that each frame tells, ns; 0 for the frames that tell none."""
@@ -411,7 +427,7 @@ class _BootTimes:
             self._told = AUTOPILOT if (components == AUTOPILOT).any() else int(components[0])
 
 
-_WANTED = {feed.msgid for feed in FEEDS} | {text.MSGID, HEARTBEAT}
+_MEASURING = {feed.msgid for feed in FEEDS}
 
 
 def _describe(heartbeat: Any) -> str:

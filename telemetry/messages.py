@@ -249,7 +249,7 @@ class LinkStats(Message, frozen=True, kw_only=True, eq=False):
 
 
 class LinkBytes(Message, frozen=True, kw_only=True, eq=False):
-    """The byte account of one link, one row per batch; every counter only grows.
+    """The byte account of one link, a row about every second; all but `pending` only grow.
 
     ``bytes = bytes in frames + discarded + pending``. A corrupt frame is also a lost number: never add the two.
 

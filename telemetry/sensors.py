@@ -1,7 +1,7 @@
 """MAVLink columns to SI samples: which message feeds which sensor, in which units, and which values are no measurement.
 
-Several messages can feed one sensor. They are ranked by how close they are to the instrument, and once a better one
-has been heard from a component the lesser ones of that component are no longer used. Stale but plausible values never
+Several messages can feed one sensor. They are ranked by how close they are to the instrument, and as long as a better
+one is heard from a component the lesser ones of that component are not used. Stale but plausible values never
 become measurements: a fix below three dimensions, a field that ``fields_updated`` leaves out, a fix repeated under
 the same time.
 """
@@ -19,6 +19,10 @@ from telemetry.messages import AirData, Altitude, Attitude, Gnss, Imu, Message
 STANDARD_GRAVITY = 9.80665
 SEA_LEVEL_PRESSURE = 101325.0
 SEA_LEVEL_DENSITY = 1.225
+
+PATIENCE = 5_000_000_000  # ns without the better message, after which a lesser one is used again
+NEVER = -(1 << 62)
+STAMP = "stamp"  # the receiver's own time of a fix, by which a repetition is known
 
 GNSS_SIGMA = 2.5  # m, horizontal, per axis, at HDOP 1 when the receiver states no accuracy
 GNSS_VELOCITY_SIGMA = 0.3  # m/s
@@ -53,10 +57,11 @@ def _updated(values: NDArray[Any], bits: int) -> NDArray[np.bool_]:
 
 
 def _highres_imu(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
-    return _updated(values, 0x3F), {
+    columns = {
         "specific_force": _vector(values, ("xacc", "yacc", "zacc"), 1.0),
         "angular_rate": _vector(values, ("xgyro", "ygyro", "zgyro"), 1.0),
     }
+    return _updated(values, 0x3F) & _finite(columns), columns
 
 
 def _scaled_imu(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
@@ -67,33 +72,47 @@ def _scaled_imu(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
 
 
 def _attitude(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
-    angles = {"phi": values["roll"], "theta": values["pitch"], "psi": values["yaw"]}
-    return np.ones(len(values), np.bool_), {name: angle.astype(np.float64) for name, angle in angles.items()}
+    names = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
+    angles = {name: values[field].astype(np.float64) for name, field in names.items()}
+    return _finite(angles), angles
 
 
 def _attitude_quaternion(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
     w, x, y, z = (values[name].astype(np.float64) for name in ("q1", "q2", "q3", "q4"))
-    return w * w + x * x + y * y + z * z > 0.5, {
-        "phi": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        "theta": np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
-        "psi": np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    }
+    with np.errstate(invalid="ignore", over="ignore"):  # infinities from the wire are no attitude
+        square = w * w + x * x + y * y + z * z
+        return (square > 0.5) & (square < 2.0), {
+            "phi": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            "theta": np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+            "psi": np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        }
 
 
 def _altitude(altitude: NDArray[np.float64], pressure: NDArray[np.float64]) -> Columns:
     return {"altitude": altitude, "pressure": pressure, "sigma": np.full(len(altitude), ALTIMETER_SIGMA)}
 
 
+def _plausible(pressure: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Static pressure, Pa, between the Dead Sea's and that at 30 km; NaN, infinity and zero are none."""
+    return np.asarray((pressure > 1e3) & (pressure < 1.2e5))
+
+
+def _finite(columns: Columns) -> NDArray[np.bool_]:
+    """Rows without NaN or infinity."""
+    return np.asarray(np.all([np.isfinite(c).reshape(len(c), -1).all(axis=1) for c in columns.values()], axis=0))
+
+
 def _highres_altitude(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
     pressure = np.where(_updated(values, 0x200), values["abs_pressure"].astype(np.float64) * 100.0, np.nan)
-    pressure[~(pressure > 0)] = np.nan
+    pressure[~_plausible(pressure)] = np.nan
     altitude = np.where(_updated(values, 0x800), values["pressure_alt"].astype(np.float64), pressure_altitude(pressure))
-    return np.isfinite(altitude), _altitude(altitude, pressure)
+    return np.abs(altitude) < 1e5, _altitude(altitude, pressure)
 
 
 def _scaled_pressure(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
     pressure = values["press_abs"].astype(np.float64) * 100.0
-    return pressure > 0, _altitude(pressure_altitude(np.where(pressure > 0, pressure, np.nan)), pressure)
+    real = _plausible(pressure)
+    return real, _altitude(pressure_altitude(np.where(real, pressure, np.nan)), pressure)
 
 
 def _vfr_hud(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
@@ -103,7 +122,8 @@ def _vfr_hud(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
 
 def _highres_air(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
     pressure = values["diff_pressure"].astype(np.float64) * 100.0
-    return _updated(values, 0x400), {"airspeed": _calibrated_airspeed(pressure), "differential_pressure": pressure}
+    columns = {"airspeed": _calibrated_airspeed(pressure), "differential_pressure": pressure}
+    return _updated(values, 0x400) & _finite(columns), columns
 
 
 def _gps_raw_int(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
@@ -127,6 +147,7 @@ def _gps_raw_int(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
         "altitude": values["alt"] * 1e-3,
         "velocity": velocity,
         "sigma": sigma,
+        STAMP: values["time_usec"],
         "satellites": np.where(values["satellites_visible"] == 255, -1, values["satellites_visible"].astype(np.int64)),
     }
 
@@ -167,8 +188,8 @@ class Sensors:
     def __init__(self, vehicle: int, source: str) -> None:
         self._vehicle = vehicle
         self._source = source
-        self._rank: dict[type[Message], int] = {}
-        self._last_fix: dict[int, int] = {}
+        self._heard: dict[tuple[type[Message], int], int] = {}  # when each rank was last heard
+        self._last_stamp = 0
 
     def samples(
         self,
@@ -219,19 +240,30 @@ class Sensors:
         rank = np.concatenate([np.full(len(c[0]), c[1]) for c in candidates])
         order = np.argsort(rows, kind="stable")
         rows, rank = rows[order], rank[order]
-        best = np.minimum.accumulate(np.minimum(rank, self._rank.get(kind, 99)))
-        self._rank[kind] = int(best[-1])
-        keep = rank == best
-        if kind is Gnss:
-            keep &= self._new_fix(t[rows], boot)
+        columns: dict[str, Any] = {
+            name: np.concatenate([c[2][name] for c in candidates])[order] for name in candidates[0][2]
+        }
+        keep = self._best(kind, rank, t_rx[rows])
+        if STAMP in columns:
+            keep &= self._new_fix(columns.pop(STAMP))
         if not keep.any():
             return None
-        columns = {name: np.concatenate([c[2][name] for c in candidates])[order][keep] for name in candidates[0][2]}
+        columns = {name: column[keep] for name, column in columns.items()}
         rows = rows[keep]
         return kind(vehicle=self._vehicle, source=self._source, boot=boot, t=t[rows], t_rx=t_rx[rows], **columns)
 
-    def _new_fix(self, t: NDArray[np.int64], boot: int) -> NDArray[np.bool_]:
-        """Receivers repeat a fix until there is a new one: the same time again is no new measurement."""
-        before = np.concatenate([[self._last_fix.get(boot, np.iinfo(np.int64).min)], t[:-1]])
-        self._last_fix = {boot: int(t[-1])}
-        return np.asarray(t != before)
+    def _best(self, kind: type[Message], rank: NDArray[np.int64], t_rx: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Rows of whose sensor no better message has been heard for `PATIENCE`."""
+        keep = np.ones(len(rank), np.bool_)
+        for better in range(int(rank.max()) + 1):
+            heard = np.where(rank == better, t_rx, NEVER)
+            heard = np.maximum.accumulate(np.maximum(heard, self._heard.get((kind, better), NEVER)))
+            self._heard[kind, better] = int(heard[-1])
+            keep &= (rank <= better) | (t_rx - heard > PATIENCE)
+        return keep
+
+    def _new_fix(self, stamp: NDArray[np.uint64]) -> NDArray[np.bool_]:
+        """Receivers repeat a fix until there is a new one: the same time again is no new measurement; 0 is no time."""
+        before = np.concatenate([np.array([self._last_stamp], np.uint64), stamp[:-1]])
+        self._last_stamp = int(stamp[-1])
+        return np.asarray((stamp != before) | (stamp == 0))

@@ -212,6 +212,9 @@ def test_settings_come_from_a_file_and_mistakes_in_it_are_named(log, tmp_path):
         w["reason"] for w in json.loads(run("review", "a.rrd", "--json", cwd=tmp_path).stdout)["summary"]["windows"]
     ]
     assert "length" in reasons
+    (tmp_path / "mark.toml").write_text("[ingest]\nmark = '^TP (.+) (start|stop)$'\n")
+    done = run("smooth", log, "-o", "b.rrd", "--config", "mark.toml", cwd=tmp_path)
+    assert "mark.toml: mark '^TP (.+) (start|stop)$' needs the groups" in one_line(done)
     done = run("smooth", log, "-o", "b.rrd", "--config", "bad.toml", cwd=tmp_path)
     assert done.returncode == 1
     assert "bad.toml: Expected `float`, got `str` - at `$.estimate.window`" in one_line(done)

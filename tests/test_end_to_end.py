@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
+import threading
 import time
 
 import pytest
@@ -113,6 +114,36 @@ def test_a_real_log_replayed_over_udp_is_archived_byte_for_byte(tmp_path):
         assert live.end() == 0, live.said
     assert (tmp_path / "s" / "raw.tlog").stat().st_size == log.stat().st_size
     assert run("verify", tmp_path / "s").returncode == 0
+
+
+def test_interrupted_while_telemetry_goes_on(flight, tmp_path):
+    port = free_port()
+    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", tmp_path / "s") as live:
+        live.wait_for("listening")
+        sender = threading.Thread(target=send, args=(flight, port))
+        sender.start()
+        time.sleep(2.0)
+        live.process.send_signal(signal.SIGINT)
+        begin = time.monotonic()
+        assert live.end() == 0, live.said
+        assert time.monotonic() - begin < 10
+        sender.join()
+    assert run("verify", tmp_path / "s").returncode == 0
+
+
+def test_a_recording_that_fails_does_not_take_the_evidence_with_it(flight, tmp_path):
+    """The recorder cannot begin, because something took its place after the sortie had its folder."""
+    port = free_port()
+    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", tmp_path / "s", "--idle", 1.5) as live:
+        (tmp_path / "s").mkdir(exist_ok=True)
+        while not (tmp_path / "s" / "raw.tlog").exists():
+            time.sleep(0.001)
+        (tmp_path / "s" / "live.rrd").write_text("in the way")
+        live.wait_for("ALARM")
+        sent = send(flight, port)
+        assert live.end() == 1
+    assert "live.rrd exists and a recording is never overwritten" in live.said
+    assert (tmp_path / "s" / "raw.tlog").stat().st_size == sent.octets + 8 * sent.datagrams
 
 
 def test_nothing_received_is_said(tmp_path):

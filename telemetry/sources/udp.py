@@ -14,7 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -103,6 +103,13 @@ class UdpSource:
     batch : float
         Longest time a frame waits for others, s.
 
+    Attributes
+    ----------
+    dropped : int
+        Frames in batches that were not handed out.
+    troubles : dict of str to int
+        What the network complained of, and how often; receiving goes on.
+
     Raises
     ------
     ValueError
@@ -117,6 +124,7 @@ class UdpSource:
         self.endpoints = [parse_endpoint(text) for text in endpoints]
         self.links = [str(i) for i in range(len(self.endpoints))]
         self.dropped = 0
+        self.troubles: dict[str, int] = {}
         self._dialect = dialect
         self._raw_log = raw_log
         self._batch = batch
@@ -138,6 +146,10 @@ class UdpSource:
     def stop(self) -> None:
         """Stop receiving; `batches` ends when it has handed out what was received."""
         self._stopping.set()
+
+    def join(self) -> None:
+        """Wait until the receiving thread has ended and the raw log is closed."""
+        self._thread.join()
 
     def batches(self, idle: float | None = None) -> Iterator[Frames]:
         """Yield what has arrived, in order, until `stop`.
@@ -196,6 +208,7 @@ class UdpSource:
         pieces: list[tuple[int, int, bytes]] = []
         oldest = 0.0
         while True:
+            stopping = self._stopping.is_set()  # what has arrived by now is still taken
             now = time.monotonic()
             if calling and now - said >= 1.0:
                 said = now
@@ -204,23 +217,32 @@ class UdpSource:
                         sock.send(hello)
                     except OSError:  # nobody there yet
                         pass
-            for key, _ in selector.select(self._batch if pieces else 0.05):
+            for key, _ in selector.select(0.0 if stopping else self._batch if pieces else 0.05):
                 for _ in range(256):  # a busy link must not starve the others
-                    try:
-                        datagram = key.fileobj.recv(65535)  # type: ignore[union-attr]
-                    except (BlockingIOError, ConnectionRefusedError):
+                    datagram = self._read(key.fileobj)
+                    if datagram is None:
                         break
                     last = max((time.monotonic_ns() + anchor) // TICK * TICK, last + TICK)
                     if not pieces:
                         oldest = time.monotonic()
                     pieces.append((last, key.data, datagram))
-            if pieces and (time.monotonic() - oldest >= self._batch or len(pieces) >= 1024 or self._stopping.is_set()):
+            if pieces and (stopping or time.monotonic() - oldest >= self._batch or len(pieces) >= 1024):
                 self._hand_over(pieces)
                 pieces = []
-            elif self._stopping.is_set():
-                return
             elif self._raw_log:
                 self._raw_log.sync(force=False)
+            if stopping:
+                return
+
+    def _read(self, sock: Any) -> bytes | None:
+        """The next datagram; None when there is none, or the network says that there will be none for now."""
+        try:
+            return bytes(sock.recv(65535))
+        except BlockingIOError:
+            return None
+        except OSError as error:  # e.g. the far end's network is gone: it may come back, and other links are there
+            self.troubles[error.strerror or str(error)] = self.troubles.get(error.strerror or str(error), 0) + 1
+            return None
 
     def _hand_over(self, pieces: list[tuple[int, int, bytes]]) -> None:
         data = np.frombuffer(b"".join(piece for _, _, piece in pieces), np.uint8)

@@ -191,6 +191,45 @@ def test_a_receive_clock_that_steps_back_is_told_and_time_runs_on():
     assert (np.diff(t_rx) > 0).all()
 
 
+def test_a_receive_clock_that_creeps_back_is_judged_by_the_newest_time_however_it_is_cut():
+    sender = Sender()
+    seconds = [0, 10, 9.2, 8.4, 20]
+    log = tlog([(US + round(s * 1e6), sender.pressure(1000 + 1000 * i, 900)) for i, s in enumerate(seconds)])
+    whole, cut = run(read(log)), run(read(log, [80, 120, 140]))
+    assert_same(columns(cut), columns(whole))
+    assert sum("the receive clock stepped back by" in text for text in texts(whole)) == 1
+
+
+def test_an_unknown_id_does_not_invent_a_sender():
+    messages = run(
+        [scan(Sender(9).unknown(), Sender(1).attitude(1), Sender(1, 33).unknown(), Sender(1, seq=1).unknown())]
+    )
+    assert [(m.vehicle, m.source) for m in told(messages, LinkStats)] == [(1, "0/1")]
+    assert told(messages, LinkStats)[-1].received[-1] == 2
+    assert told(messages, LinkBytes)[-1].unknown[-1] == 3
+
+
+def test_who_speaks_over_two_links_is_told_by_who_was_heard_first():
+    sender = Sender()
+    beats = [sender.heartbeat(), sender.heartbeat()]
+    found = scan(*beats)
+    linked = type(found)(
+        **{n: getattr(found, n) for n in found.__dataclass_fields__} | {"link": np.array([1, 0], np.uint8)}
+    )
+    (said,) = told(run([linked], links=("0", "1")), Event)
+    assert said.t_rx[0] == found.t_rx[0]
+
+
+def test_a_mark_over_two_links_is_one_mark():
+    sender = Sender()
+    frames = [sender.attitude(1000), sender.text("TP 1 start")]
+    found = scan(*frames, frames[1])
+    linked = type(found)(
+        **{n: getattr(found, n) for n in found.__dataclass_fields__} | {"link": np.array([0, 0, 1], np.uint8)}
+    )
+    assert len(told(run([linked], links=("0", "1")), Mark)) == 1
+
+
 def test_every_byte_is_in_the_account_and_damage_is_told():
     log = tlog(flight(5)[:-3]) + b"rubbish" + tlog(flight(5)[-3:])
     messages = run(read(log[:-4]))

@@ -10,14 +10,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from telemetry.mavlink import Dialect
 from telemetry.messages import AirData, Altitude, Attitude, Gnss, Imu
-from telemetry.sensors import Sensors, pressure_altitude
+from telemetry.sensors import PATIENCE, Sensors, pressure_altitude
 from tests.telemetry.test_frames import scan
 from tests.telemetry.wire import Sender
 
 DIALECT = Dialect()
 
 
-def samples(*messages, sensors=None, t=None):
+def samples(*messages, sensors=None, t=None, later=0):
     """What a batch of messages measures, by kind."""
     sender = Sender()
     frames = scan(*[sender.pack(m) for m in messages])
@@ -27,7 +27,7 @@ def samples(*messages, sensors=None, t=None):
         decoded[msgid] = rows, DIALECT.decode(frames, msgid, rows)
     t = np.arange(len(frames)) if t is None else np.array(t)
     sensors = sensors or Sensors(1, "0/1")
-    return {type(m): m for m in sensors.samples(decoded, t, frames.t_rx, 0)}
+    return {type(m): m for m in sensors.samples(decoded, t, frames.t_rx + later, 0)}
 
 
 def highres(bits=0xFFFF, **values):
@@ -131,8 +131,32 @@ def test_a_fix_that_is_none_is_no_measurement(bad):
     assert not samples(gps(**bad))
 
 
+@pytest.mark.parametrize("pressure", [math.inf, -math.inf, math.nan, 3e38, 0.0, -5.0, 1e-30])
+def test_a_pressure_that_is_none_is_no_measurement(pressure):
+    assert Altitude not in samples(mavlink.MAVLink_scaled_pressure_message(5, pressure, 0.0, 0))
+    assert Altitude not in samples(highres(bits=0x200, abs_pressure=pressure))
+
+
+@pytest.mark.parametrize("value", [math.inf, math.nan])
+def test_infinity_is_no_measurement_of_anything(value):
+    assert not samples(
+        highres(bits=0x1FFF, xacc=value, diff_pressure=value, pressure_alt=value, abs_pressure=value),
+        mavlink.MAVLink_attitude_message(5, value, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_attitude_quaternion_message(5, value, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_vfr_hud_message(value, value, 0, 0, value, value),
+    )
+
+
+def test_when_the_better_message_falls_silent_the_lesser_is_used_again():
+    sensors = Sensors(1, "0/1")
+    samples(highres(zacc=-9.0), sensors=sensors)
+    scaled = mavlink.MAVLink_scaled_imu_message(5, 0, 0, -1000, 0, 0, 0, 0, 0, 0)
+    assert Imu not in samples(scaled, sensors=sensors)
+    assert Imu in samples(scaled, sensors=sensors, later=PATIENCE + 1_000_000)
+
+
 def test_a_repeated_fix_is_no_new_measurement():
     sensors = Sensors(1, "0/1")
     first = samples(gps(us=1), gps(us=1), gps(us=2), sensors=sensors, t=[1, 1, 2])[Gnss]
     assert first.t.tolist() == [1, 2]
-    assert Gnss not in samples(gps(us=2), sensors=sensors, t=[2])
+    assert Gnss not in samples(gps(us=2), sensors=sensors, t=[3])

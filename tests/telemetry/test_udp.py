@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import threading
 import time
@@ -13,6 +14,7 @@ from telemetry.frames import join
 from telemetry.ingest import guarded, ingest
 from telemetry.mavlink import Dialect
 from telemetry.messages import Attitude, Event
+from telemetry.sources import udp
 from telemetry.sources.udp import UdpSource, parse_endpoint
 from tests.telemetry.test_archive import FullDisk
 from tests.telemetry.test_frames import frames_of, read
@@ -108,6 +110,56 @@ def test_a_full_disk_raises_an_alarm_and_the_samples_go_on(port, tmp_path):
     assert any("ALARM" in text and "No space left on device" in text for text in told)
     assert any("raw telemetry is being kept again" in text for text in told)
     assert sum(len(m.t) for m in messages if isinstance(m, Attitude)) == 40
+
+
+def test_stop_works_while_telemetry_goes_on(port):
+    source = UdpSource([f"udpin:127.0.0.1:{port}"], DIALECT)
+    sender, over = Sender(), threading.Event()
+
+    def send():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            while not over.wait(0.002):
+                sock.sendto(sender.attitude(1), ("127.0.0.1", port))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    threading.Timer(0.3, source.stop).start()
+    begin = time.monotonic()
+    received = sum(len(batch) for batch in source.batches())
+    took = time.monotonic() - begin
+    over.set()
+    thread.join()
+    assert received > 0
+    assert took < 3
+
+
+class _LostNetwork:
+    """A socket that complains now and then, as one does when the far end's network goes away."""
+
+    def __init__(self, sock) -> None:
+        self._sock, self._calls = sock, 0
+
+    def recv(self, size: int) -> bytes:
+        self._calls += 1
+        if self._calls % 3 == 0:
+            raise OSError(errno.EHOSTUNREACH, "No route to host")
+        return self._sock.recv(size)
+
+    def __getattr__(self, name):
+        return getattr(self._sock, name)
+
+
+def test_a_complaint_of_the_network_does_not_end_the_reception(port, monkeypatch):
+    opened = udp._open
+    monkeypatch.setattr(udp, "_open", lambda endpoint: _LostNetwork(opened(endpoint)))
+    source = UdpSource([f"udpin:127.0.0.1:{port}"], DIALECT)
+    sender = Sender()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        for i in range(30):
+            sock.sendto(sender.attitude(i), ("127.0.0.1", port))
+            time.sleep(0.005)
+    assert sum(len(batch) for batch in source.batches(idle=0.3)) == 30
+    assert source.troubles["No route to host"] > 0
 
 
 def test_links_are_numbered_by_endpoint(port):
