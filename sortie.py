@@ -123,7 +123,9 @@ def ingest(
             say(f"{name}: listening on {', '.join(endpoint)}, bus on {listen}")
             messages = telemetry.ingest.ingest(source.batches(idle), source.links, dialect, configuration.ingest)
             messages = telemetry.ingest.guarded(messages, raw_log, lambda: source.dropped)
-            if not publish(bus, "ingest", watch(messages, say)):
+            drained = publish(bus, "ingest", watch(messages, say))
+            bus.linger()  # the others still talk to one another over the bus that is carried here
+            if not drained:
                 raise Failure("a consumer on the bus had not processed everything in time; the raw log is whole")
         finally:
             source.stop()
@@ -152,9 +154,11 @@ def estimate(*, sortie: str, connect: str = BUS, config: Path | None = None) -> 
         subscription = bus.subscribe("estimate", ["ingest"])
         stop_on_signals(subscription.stop)
         say(f"{sortie}: estimating on {connect}")
-        samples = (message for message in subscription if message is not None)
-        publish(bus, "estimate", estimator.stage.estimate(samples, configuration.estimate))
+        samples = watch((message for message in subscription if message is not None), say, every=False)
+        drained = publish(bus, "estimate", estimator.stage.estimate(samples, configuration.estimate))
         subscription.close()
+        if not drained:
+            raise Failure("a consumer on the bus had not processed every estimate in time, or the bus is gone")
 
 
 def record(folder: Path, *, sortie: str, connect: str = BUS) -> None:

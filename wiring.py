@@ -117,14 +117,15 @@ def open_log(log: Path, configuration: Any, on_progress: Callable[[int], None] |
     from telemetry.mavlink import Dialect
     from telemetry.sources.tlog import TlogSource
 
-    links = 1
-    if log.is_dir():
+    links, ours = 1, log.is_dir()
+    if ours:
         _, links, ran = _read_what_ran(log)
         configuration = configuration or ran
         log = log / "raw.tlog"
     configuration = configuration or configure(None)
     dialect = Dialect(configuration.ingest.dialect)
-    return TlogSource(log, dialect, links=links, on_progress=on_progress), dialect, configuration
+    source = TlogSource(log, dialect, links=links, trusted=ours, on_progress=on_progress)
+    return source, dialect, configuration
 
 
 def new_folder(name: str | None, folder: Path | None, *, shared: bool = False) -> tuple[str, Path]:

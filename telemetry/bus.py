@@ -8,6 +8,9 @@ A stage numbers its output (`Message.sequence`) without gaps over all its stream
 together again in that order, whatever the network did to them; what does not come within `PATIENCE` is reported as
 missing, never skipped in silence. Publishers block rather than drop, keep a cache for late joiners, and at the end
 wait until every consumer has processed the last message, because closing a session does not drain it.
+
+Who is there is told by liveliness tokens, which vanish with their process: ``alive/{session}/{stage}/{instance}`` of
+a publisher, ``listening/{session}/{service}/{stage}`` of a subscription.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -30,6 +33,7 @@ from telemetry.messages import Event, Message, Progress, decode, encode, event, 
 
 PATIENCE = 5.0
 DRAIN = 30.0
+GRACE = 1.0
 CACHE = 8192
 _MSGPACK = "application/msgpack"
 _LOOPBACK = re.compile(r"^tcp/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+$")
@@ -92,6 +96,7 @@ class Bus:
                     "the bus does not leave this machine"
                 )
         self.root = f"sortie/{chunk(sortie)}"
+        self._client = bool(connect) and not listen
         mode = "router" if listen else "client" if connect else "peer"
         zenoh.init_log_from_env_or("error")
         end = None if wait is None else time.monotonic() + wait
@@ -117,6 +122,38 @@ class Bus:
     def subscribe(self, service: str, stages: Sequence[str]) -> Subscription:
         """Everything that `stages` say, for a consumer named `service`."""
         return Subscription(self, service, stages)
+
+    @property
+    def connected(self) -> bool:
+        """False while a client has lost its router."""
+        return not self._client or bool(self.session.info.routers_zid())
+
+    def token(self, kind: str, *chunks: str) -> Any:
+        """Show that something is there, until the token is undeclared or the process is gone."""
+        return self.session.liveliness().declare_token(
+            "/".join((self.root, kind, str(self.session.info.zid()), *chunks))
+        )
+
+    def tokens(self, pattern: str) -> list[list[str]]:
+        """Who is there: kind, session and what follows."""
+        replies = self.session.liveliness().get(f"{self.root}/{pattern}", timeout=1.0)
+        return [str(reply.ok.key_expr).removeprefix(f"{self.root}/").split("/") for reply in replies if reply.ok]
+
+    def linger(self, deadline: float = DRAIN) -> bool:
+        """Wait until no other session publishes or listens any more, so that whoever carries the bus leaves last.
+
+        Returns
+        -------
+        bool
+            False when one still did after `deadline` seconds.
+        """
+        end = time.monotonic() + deadline
+        own = str(self.session.info.zid())
+        while any(session != own for kind in ("alive", "listening") for _, session, *_ in self.tokens(f"{kind}/**")):
+            if time.monotonic() > end:
+                return False
+            time.sleep(0.05)
+        return True
 
     def close(self) -> None:
         """Close the session; what is still on the way may be lost, so publishers `finish` first."""
@@ -144,6 +181,7 @@ class Publisher:
         self._stage = stage
         self._instance = secrets.token_hex(4)  # a restarted stage counts from 0 again, and must be told apart
         self._publishers: dict[str, Any] = {}
+        self._alive = bus.token("alive", chunk(stage), self._instance)
 
     def put(self, message: Message) -> None:
         """Send one message; blocks while a consumer is too slow."""
@@ -165,38 +203,30 @@ class Publisher:
         self._publishers[key].put(encode(numbered), attachment=self._instance)
 
     def finish(self, deadline: float = DRAIN) -> bool:
-        """Wait until every consumer has processed the last message.
+        """Wait until every consumer has processed the last message; the stage then no longer counts as there.
 
         Returns
         -------
         bool
-            False when one had not within `deadline` seconds.
+            False when one had not within `deadline` seconds, or nobody can tell because the router is gone.
         """
         end = time.monotonic() + deadline
-        session = self._bus.session
-        while True:
-            listening = [
-                str(r.ok.key_expr).split("/")[-2]
-                for r in session.liveliness().get(f"{self._bus.root}/listening/*/{chunk(self._stage)}", timeout=1.0)
-                if r.ok
-            ]
-            done = {}
-            for reply in session.get(f"{self._bus.root}/ack/*/{chunk(self._stage)}", timeout=1.0):
-                if reply.ok:
-                    service, instance, processed = reply.ok.payload.to_string().split(" ")
-                    done[service] = int(processed) if instance == self._instance else -1
-            if all(done.get(service, -1) >= self.sequence - 1 for service in listening):
-                return True
-            if time.monotonic() > end:
-                return False
+        while not (done := self._bus.connected and self._processed()) and time.monotonic() < end:
             time.sleep(0.02)
+        if self._alive is not None:
+            self._alive.undeclare()
+            self._alive = None
+        return done
 
-
-class _Arrival(NamedTuple):
-    stage: str
-    instance: str
-    schema: str
-    payload: bytes
+    def _processed(self) -> bool:
+        stage = chunk(self._stage)
+        listening = [service for _, _, service, _ in self._bus.tokens(f"listening/*/*/{stage}")]
+        done = {}
+        for reply in self._bus.session.get(f"{self._bus.root}/ack/*/{stage}", timeout=1.0):
+            if reply.ok:
+                service, instance, processed = reply.ok.payload.to_string().split(" ")
+                done[service] = int(processed) if instance == self._instance else -1
+        return all(done.get(service, -1) >= self.sequence - 1 for service in listening)
 
 
 class _Order:
@@ -206,42 +236,75 @@ class _Order:
         self.stage = stage
         self.instance = ""
         self.next = 0
-        self.waiting: list[tuple[int, Message]] = []
-        self.waiting_since = 0.0
+        self.processed = -1
         self.final = False
+        self.waiting: dict[int, tuple[float, Message]] = {}  # when each came, oldest first
+        self._numbers: list[int] = []  # those that wait, as a heap
+        self._given_up = -1  # no gap below this number is waited for
 
-    def add(self, instance: str, message: Message) -> str | None:
-        """Take a message in; the answer is a text if the stage turned out to have been restarted."""
-        said = None
+    def add(self, instance: str, message: Message) -> int | None:
+        """Take a message in; if the stage turned out to have been restarted, how many of its messages are lost."""
+        lost = None
         if instance != self.instance:
-            said = f"stage {self.stage} was restarted" if self.instance else None
-            self.instance, self.next, self.waiting = instance, 0, []
-        if message.sequence >= self.next and all(message.sequence != number for number, _ in self.waiting):
-            heapq.heappush(self.waiting, (message.sequence, message))
-        return said
+            if self.instance:
+                lost = max(self.waiting, default=self.next - 1) + 1 - self.next
+            self.processed = -1  # before the instance, for whoever is asked meanwhile
+            self.instance, self.next, self._given_up = instance, 0, -1
+            self.waiting, self._numbers = {}, []
+        number = message.sequence
+        if number >= self.next and number not in self.waiting:
+            self.waiting[number] = time.monotonic(), message
+            heapq.heappush(self._numbers, number)
+        return lost
 
     def ready(self) -> Iterator[Message]:
-        while self.waiting and self.waiting[0][0] == self.next:
-            self.next += 1
-            self.waiting_since = time.monotonic()
-            message = heapq.heappop(self.waiting)[1]
+        while self._numbers and self._numbers[0] <= max(self.next, self._given_up):
+            number = heapq.heappop(self._numbers)
+            _, message = self.waiting.pop(number)
+            self.next = number + 1
             self.final = self.final or (isinstance(message, Progress) and message.final)
             yield message
 
     def overdue(self) -> int:
-        """Messages to give up, if the next one has been missing for too long."""
-        if not self.waiting:
-            self.waiting_since = time.monotonic()
+        """Give up, all at once, what messages have waited for too long for; the answer is how many."""
+        limit = time.monotonic() - PATIENCE
+        last = -1
+        for number, (came, _) in self.waiting.items():
+            if came > limit:
+                break
+            last = max(last, number)
+        if last < 0:
             return 0
-        if time.monotonic() - self.waiting_since < PATIENCE:
-            return 0
-        missing = self.waiting[0][0] - self.next
-        self.next = self.waiting[0][0]
-        return missing
+        self._given_up = last
+        return last + 1 - self.next - sum(number <= last for number in self.waiting)
+
+
+class _Presence:
+    """Whether a stage is there, by its tokens."""
+
+    def __init__(self, tokens: Any) -> None:
+        self.tokens = tokens
+        self.gone = False
+        self._alive: set[str] = set()
+        self._left = float("inf")
+
+    def changed(self) -> bool:
+        """Whether the stage went, at least `GRACE` ago, or came back."""
+        while (sample := self.tokens.try_recv()) is not None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._alive.add(str(sample.key_expr))
+            else:
+                self._alive.discard(str(sample.key_expr))
+                self._left = time.monotonic()
+        gone = not self._alive and (self.gone or time.monotonic() - self._left > GRACE)
+        changed, self.gone = gone != self.gone, gone
+        return changed
 
 
 class Subscription:
     """What some stages say, in their order; ends when each has said its last.
+
+    An event tells when a stage goes before that, and when it is back: it may be restarted, so nothing ends.
 
     Iterating yields messages, and now and then None when nothing has come for 0.1 s, so that a consumer can do what
     time asks of it. A message counts as processed when the next one is asked for.
@@ -260,7 +323,7 @@ class Subscription:
         self._bus = bus
         self._service = chunk(service)
         self._orders = {chunk(stage): _Order(stage) for stage in stages}
-        self._processed = dict.fromkeys(self._orders, -1)
+        self._presences: list[_Presence] = []
         self._stopping = threading.Event()
         self._fifo: list[Any] = []
         self._handles: list[Any] = []
@@ -278,14 +341,17 @@ class Subscription:
             self._handles.append(
                 bus.session.declare_queryable(f"{bus.root}/ack/{self._service}/{stage}", self._answer(stage))
             )
-            self._handles.append(
-                bus.session.liveliness().declare_token(f"{bus.root}/listening/{self._service}/{stage}")
+            self._handles.append(bus.token("listening", self._service, stage))
+            alive = bus.session.liveliness().declare_subscriber(
+                f"{bus.root}/alive/*/{stage}/*", zenoh.handlers.FifoChannel(1024), history=True
             )
+            self._handles.append(alive)
+            self._presences.append(_Presence(alive))
 
     def _answer(self, stage: str) -> Callable[[Any], None]:
         def reply(query: Any) -> None:
             order = self._orders[stage]
-            query.reply(query.key_expr, f"{self._service} {order.instance} {self._processed[stage]}")
+            query.reply(query.key_expr, f"{self._service} {order.instance} {order.processed}")
 
         return reply
 
@@ -297,28 +363,32 @@ class Subscription:
         """Stop listening."""
         for handle in (*self._fifo, *self._handles):
             handle.undeclare()
-        self._fifo, self._handles = [], []
+        self._fifo, self._handles, self._presences = [], [], []
 
     def __iter__(self) -> Iterator[Message | None]:
         while not self._stopping.is_set():
             idle = True
-            for stage, fifo in zip(self._orders, self._fifo, strict=True):
-                order = self._orders[stage]
+            for order, fifo, presence in zip(self._orders.values(), self._fifo, self._presences, strict=True):
+                drained = False
                 for _ in range(1024):
                     sample = fifo.try_recv()
                     if sample is None:
+                        drained = True
                         break
                     idle = False
                     yield from self._take(order, sample)
-                missing = order.overdue()
+                # What is missing, or the last word, may still be in there after a long stall of the consumer.
+                missing = order.overdue() if drained else 0
                 if missing:
                     self.missing += missing
                     yield self._tell(f"{missing} messages of stage {order.stage} never arrived", "error")
-                    idle = False
                 for message in order.ready():
                     idle = False
                     yield message
-                    self._processed[stage] = message.sequence
+                    order.processed = message.sequence
+                if drained and not order.waiting and not order.final and presence.changed():
+                    state, level = ("gone", "warning") if presence.gone else ("back", "info")
+                    yield self._tell(f"stage {order.stage} is {state}", level)
             if all(order.final for order in self._orders.values()):
                 return
             if idle:
@@ -336,9 +406,11 @@ class Subscription:
             if self.refused in (1, 10, 100, 1000):  # a flood of them must not become a flood of events
                 yield self._tell(f"refused {self.refused} payloads on {sample.key_expr}: {error}", "error")
             return
-        restarted = order.add(sample.attachment.to_string() if sample.attachment else "", message)
-        if restarted:
-            yield self._tell(restarted, "warning")
+        lost = order.add(sample.attachment.to_string() if sample.attachment else "", message)
+        if lost is not None:
+            self.missing += lost
+            text = f"stage {order.stage} was restarted"
+            yield self._tell(f"{text}; {lost} messages of before are lost" if lost else text, "warning")
 
     def _tell(self, text: str, level: Any) -> Event:
         now = time.time_ns()
@@ -348,7 +420,8 @@ class Subscription:
 def publish(bus: Bus, stage: str, messages: Iterable[Message]) -> bool:
     """Put all a stage says on the bus.
 
-    If making the messages fails, consumers are told why and that nothing more will come, and the error goes on.
+    If making the messages fails, consumers are told why and that nothing more will come, and the error goes on. An
+    interruption is no failure, and ends the output too.
 
     Returns
     -------
@@ -361,9 +434,12 @@ def publish(bus: Bus, stage: str, messages: Iterable[Message]) -> bool:
             publisher.put(message)
     except BaseException as error:
         now = time.time_ns()
-        publisher.put(event(f"stage {stage} failed: {error}", level="error", source=stage, t=now, t_rx=now))
+        if not isinstance(error, KeyboardInterrupt):
+            text = f"stage {stage} failed: {str(error).strip() or type(error).__name__}"
+            publisher.put(event(text, level="error", source=stage, t=now, t_rx=now))
         times = np.array([now], np.int64)
         publisher.put(Progress(vehicle=0, source=stage, boot=0, t=times, t_rx=times, final=True))
+        publisher.finish(GRACE)
         raise
     return publisher.finish()
 

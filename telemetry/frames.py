@@ -17,13 +17,14 @@ After any failure the scan moves on by one byte, because a good frame may start 
     bytes in = bytes in frames + record headers + discarded + pending
 
 A frame whose id the dialect does not know cannot be checked: it counts as a frame only where framing on both sides
-agrees.
+agrees. A record's time cannot be checked either: a day or more off the record before, it counts only where the record
+after agrees, so that a damaged one dates nothing but a lasting step of the recorder's clock is kept.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ JUNK = b"\x00junk"
 JUNK_HEADER = HEADER + len(JUNK) + 2
 LONGEST_JUNK = 0xFFFF
 LATEST = 7_258_118_400_000_000  # the year 2200, us: what lies beyond is no time
+DAY = 86_400_000_000  # us
 
 _NOTHING, _GOOD, _UNKNOWN, _CORRUPT, _SHORT = range(5)
 
@@ -68,7 +70,7 @@ class Frames:
     pending : int
         Bytes at the end that may be the beginning of a frame.
     until : int
-        Every frame with ``t_rx <= until`` is in this batch or an earlier one.
+        All that came with ``t_rx <= until``, frames and junk, is in this batch or an earlier one.
     """
 
     data: NDArray[np.uint8]
@@ -111,6 +113,13 @@ class Frames:
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _PER_FRAME}
         columns |= {name: getattr(self, name)[:0] for name in _PER_JUNK}
         return Frames(self.data, **columns, until=self.until)
+
+    def compact(self) -> Frames:
+        """The same frames, without junk, over bytes and columns of their own: for those kept while the rest may go."""
+        end = np.cumsum(self.length)
+        start = end - self.length
+        rows = np.repeat(self.start - start, self.length) + np.arange(self.length.sum())
+        return replace(self.select(np.arange(len(self))), data=self.data[rows], start=start)
 
     def checksum(self) -> NDArray[np.int64]:
         """Checksum bytes of every frame, shape (k,): tells a repeated frame from a different one of the same number."""
@@ -159,6 +168,8 @@ _CRC = _crc_table()  # CRC-16/MCRF4XX: reflected polynomial 0x1021, start 0xFFFF
 @njit(cache=True, nogil=True)
 def _frame_at(data, i, end, extra, table):  # type: ignore[no-untyped-def]
     """What begins at data[i], given that bytes from `end` on are not ours: (status, length, msgid)."""
+    if i >= end:
+        return _NOTHING, 0, 0
     stx = data[i]
     if stx != STX2 and stx != STX1:
         return _NOTHING, 0, 0
@@ -196,6 +207,15 @@ def _is_stx(data, i, end):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _is_corrupt(data, i, end, extra, table):  # type: ignore[no-untyped-def]
+    """Whether a run of no frame, data[i:end], begins like one of a known id: told by its own bytes alone, so that it
+    is the same live and out of the archive.
+    """
+    status, length, _ = _frame_at(data, i, end, extra, table)
+    return status == _CORRUPT or (status == _SHORT and length > 0)
+
+
+@njit(cache=True, nogil=True)
 def _scan_datagrams(data, bounds, extra, table, rows, known, junk, corrupt):  # type: ignore[no-untyped-def]
     """Fill rows (k,4: start, length, msgid, datagram), known (k,), junk (j,3: start, length, datagram), corrupt
     (j,).
@@ -218,11 +238,12 @@ def _scan_datagrams(data, bounds, extra, table, rows, known, junk, corrupt):  # 
             else:
                 if aligned:
                     junk[runs, 0], junk[runs, 1], junk[runs, 2] = i, 0, record
-                    corrupt[runs] = status == _CORRUPT or (status == _SHORT and length > 0)
                     runs += 1
                 aligned = False
                 junk[runs - 1, 1] += 1
                 i += 1
+    for run in range(runs):
+        corrupt[run] = _is_corrupt(data, junk[run, 0], junk[run, 0] + junk[run, 1], extra, table)
     return frames, runs
 
 
@@ -235,71 +256,99 @@ def _time_at(data, i):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _scan_tlog(data, final, aligned, last, extra, table, rows, known, junk, corrupt, mark):  # type: ignore[no-untyped-def]
+def _record_time(data, i, after, final, last, low):  # type: ignore[no-untyped-def]
+    """Time of the record data[i:after], us: the record before's, `last`, if its own is not to be believed (such
+    records are not counted); -1 if that depends on the record after and it is not here yet. The bits `low` are no
+    time and always its own. The log's first record is believed.
+    """
+    t = _time_at(data, i)
+    if 0 <= t < LATEST:
+        if last <= low or -DAY < t - last < DAY:
+            return t
+        if after + HEADER > len(data):
+            if not final:
+                return -1
+        elif -DAY < _time_at(data, after) - t < DAY:
+            return t
+    return last & ~low | t & low
+
+
+@njit(cache=True, nogil=True)
+def _mark_at(data, i, mark):  # type: ignore[no-untyped-def]
+    """Whether data[i:] begins with the mark: _GOOD or _NOTHING; _SHORT if it ends before that can be told."""
+    for k in range(len(mark)):
+        if i + k >= len(data):
+            return _SHORT
+        if data[i + k] != mark[k]:
+            return _NOTHING
+    return _GOOD
+
+
+@njit(cache=True, nogil=True)
+def _scan_tlog(data, final, aligned, last, low, extra, table, rows, known, junk, corrupt, mark):  # type: ignore[no-untyped-def]
     """Fill rows (k,4: start, length, msgid, us), junk (j,3: start, length, us); return where it stopped and the
     account.
 
-    `aligned`: data[0] is where a record should begin. `last`: time of the record before, us.
+    `aligned`: data[0] is where a record should begin; if not, a run of discarded bytes that began in the block before
+    goes on. `last`: time of the record before, us. `low`: bits of a time that are none.
     """
     i = 0
     n = len(data)
     frames = 0
     runs = 0
     headers = 0
-    open_run = not aligned  # a run of discarded bytes that began in the block before goes on
-    if open_run:
+    if not aligned:
         junk[0, 0], junk[0, 1], junk[0, 2] = 0, 0, last
         corrupt[0] = False
         runs = 1
-    while i + 8 < n:
-        if aligned and i + 15 <= n and data[i + 8] == 0:
-            same = True
-            for k in range(len(mark)):
-                same = same and data[i + 8 + k] == mark[k]
-            if same:
-                size = int(data[i + 13]) | int(data[i + 14]) << 8
-                if i + 15 + size <= n:
-                    t = _time_at(data, i)
-                    if 0 <= t < LATEST:
-                        last = t
-                    junk[runs, 0], junk[runs, 1], junk[runs, 2] = i + 15, size, last
-                    status, length, msgid = _frame_at(data, i + 15, i + 15 + size, extra, table)
-                    corrupt[runs] = status == _CORRUPT or (status == _SHORT and length > 0)
-                    runs += 1
-                    headers += 15
-                    i += 15 + size
-                    continue
-                if not final:
+    while i + HEADER < n:
+        mine = _mark_at(data, i + HEADER, mark) if aligned else _NOTHING
+        if mine != _NOTHING:
+            start = i + JUNK_HEADER
+            after = start
+            if start <= n:
+                after += int(data[start - 2]) | int(data[start - 1]) << 8
+            if after <= n:
+                t = _record_time(data, i, after, final, last, low)
+                if t < 0:
                     break
-        status, length, msgid = _frame_at(data, i + 8, n, extra, table)
+                last = t
+                junk[runs, 0], junk[runs, 1], junk[runs, 2] = start, after - start, last
+                corrupt[runs] = _is_corrupt(data, start, after, extra, table)
+                runs += 1
+                headers += JUNK_HEADER
+                i = after
+                continue
+            if not final:
+                break
+        status, length, msgid = _frame_at(data, i + HEADER, n, extra, table)
         if status == _SHORT and not final:
             break
+        after = i + HEADER + length
         ok = status == _GOOD
         if status == _UNKNOWN and aligned:
-            after = i + 8 + length
-            if after + 8 >= n and not final:
+            next_mark = _mark_at(data, after + HEADER, mark)
+            if next_mark == _SHORT and not final:
                 break
-            ok = after == n or _is_stx(data, after + 8, n)
+            ok = after == n or _is_stx(data, after + HEADER, n) or next_mark == _GOOD
         if ok:
-            t = _time_at(data, i)
-            # After garbage the 8 bytes before a frame may be garbage too: a day off, they are no time.
-            if 0 <= t < LATEST and (not open_run or last == 0 or abs(t - last) < 86_400_000_000):
-                last = t
-            rows[frames, 0], rows[frames, 1], rows[frames, 2], rows[frames, 3] = i + 8, length, msgid, last
+            t = _record_time(data, i, after, final, last, low)
+            if t < 0:
+                break
+            last = t
+            rows[frames, 0], rows[frames, 1], rows[frames, 2], rows[frames, 3] = i + HEADER, length, msgid, last
             known[frames] = status == _GOOD
             frames += 1
-            headers += 8
-            i += 8 + length
+            headers += HEADER
+            i = after
             aligned = True
-            open_run = False
             continue
         if status == _SHORT and final and aligned and length > 0:
             break  # the log was cut inside its last frame
-        if not open_run:
+        if aligned:
             junk[runs, 0], junk[runs, 1], junk[runs, 2] = i, 0, last
             corrupt[runs] = status == _CORRUPT
             runs += 1
-            open_run = True
         aligned = False
         junk[runs - 1, 1] += 1
         i += 1
@@ -383,12 +432,14 @@ class TlogScanner:
     crc_extra : int16 array
         As in `scan_datagrams`.
     links : int
-        1: the time is a time. 2 to 4: its two lowest bits are the link number (only logs that are known to say so).
+        1: the time is a time. 2 to 4: its two lowest bits are the link number (only logs that are known to say so); a
+        number beyond the links is damage and counts as link 0.
     """
 
     def __init__(self, crc_extra: NDArray[np.int16], links: int = 1) -> None:
         self._extra = crc_extra
         self._links = links
+        self._low = 3 if links > 1 else 0
         self._rest = np.empty(0, np.uint8)
         self._aligned = True
         self._last: int = 0
@@ -406,7 +457,7 @@ class TlogScanner:
         data = np.concatenate([self._rest, np.frombuffer(block, np.uint8)])
         rows, known, junk, corrupt = _room(len(data))
         stop, frames, runs, headers, self._aligned, self._last = _scan_tlog(
-            data, final, self._aligned, self._last, self._extra, _CRC, rows, known, junk, corrupt, self._mark
+            data, final, self._aligned, self._last, self._low, self._extra, _CRC, rows, known, junk, corrupt, self._mark
         )
         self._rest = data[stop:]
         rows, junk, corrupt = rows[:frames], junk[:runs], corrupt[:runs]
@@ -414,6 +465,7 @@ class TlogScanner:
         junk, corrupt = junk[keep], corrupt[keep]
         t_rx, link = self._split(rows[:, 3])
         junk_t_rx, junk_link = self._split(junk[:, 2])
+        reached = (self._last & ~self._low) * 1000
         return Frames(
             data,
             **_columns(data, rows, known[:frames], link, t_rx),
@@ -424,13 +476,12 @@ class TlogScanner:
             junk_corrupt=corrupt,
             headers=int(headers),
             pending=len(self._rest),
-            until=int(t_rx[-1]) - (not final) if frames else 0,
+            until=reached - (not final) if reached else 0,
         )
 
     def _split(self, us: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        if self._links == 1:
-            return us * 1000, np.zeros(len(us), np.uint8)
-        return (us & ~3) * 1000, (us & 3).astype(np.uint8)
+        link = us & self._low
+        return (us - link) * 1000, np.where(link < self._links, link, 0).astype(np.uint8)
 
 
 def write_record(us: int, frame: bytes) -> bytes:

@@ -274,7 +274,7 @@ class _System:
             boot_time, frames.msgid.astype(np.int32), frames.t_rx, frames.seq, modulus, now=until, flush=final
         )
         n = epochs.decided
-        self._held = frames.select(slice(n, None)) if n < len(frames) else None
+        self._held = frames.select(slice(n, None)).compact() if n < len(frames) else None
         self.waits = int(frames.t_rx[n]) if n < len(frames) else 0
         if n == 0:
             return

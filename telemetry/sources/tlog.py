@@ -20,6 +20,8 @@ class TlogSource:
     dialect : Dialect
     links : int
         Links in the log: more than 1 only for our own raw logs, which keep the link number in the time's lowest bits.
+    trusted : bool
+        It is known to be a log (a sortie's own), whatever it begins with.
     on_progress : callable, optional
         Called with the number of bytes read so far, after each block.
 
@@ -33,11 +35,17 @@ class TlogSource:
     FileNotFoundError, IsADirectoryError, PermissionError
         If the file cannot be opened.
     ValueError
-        If it is empty, or has not one MAVLink frame in its first megabyte.
+        If it is empty, or (not `trusted`) has not one record in its first megabyte.
     """
 
     def __init__(
-        self, path: str | Path, dialect: Dialect, *, links: int = 1, on_progress: Callable[[int], None] | None = None
+        self,
+        path: str | Path,
+        dialect: Dialect,
+        *,
+        links: int = 1,
+        trusted: bool = False,
+        on_progress: Callable[[int], None] | None = None,
     ) -> None:
         self.path = Path(path)
         self.links = ["0", "1", "2", "3"][:links]
@@ -50,7 +58,7 @@ class TlogSource:
             first = file.read(BLOCK)
         if not first:
             raise ValueError(f"{self.path} is empty: nothing was recorded")
-        if not len(TlogScanner(dialect.crc_extra, links).scan(first, final=len(first) == self.size)):
+        if not trusted and not TlogScanner(dialect.crc_extra, links).scan(first, final=len(first) == self.size).headers:
             raise ValueError(f"{self.path} is no telemetry log: no MAVLink frame in its first {len(first)} bytes")
 
     def batches(self) -> Iterator[Frames]:

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 import threading
 import time
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -30,6 +36,18 @@ def stream(n: int, source: str = "ingest"):
 def collect(subscription, into: list):
     into.extend(m for m in subscription if m is not None)
     subscription.close()
+
+
+def told(received: list, service: str = "record") -> list[str]:
+    """What the bus itself had to say."""
+    return [text for m in received if isinstance(m, Event) and m.source == service for text in m.text]
+
+
+def wait_for(condition) -> None:
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -156,6 +174,59 @@ def test_what_never_arrives_is_told(monkeypatch):
     assert subscription.missing == 3
 
 
+def test_a_late_joiner_waits_once_for_what_no_cache_holds(monkeypatch):
+    """The cache of a slow stream goes back further than that of a fast one, which leaves many gaps."""
+    monkeypatch.setattr(bus_module, "PATIENCE", 0.5)
+    monkeypatch.setattr(bus_module, "CACHE", 16)
+    received: list = []
+    with Bus("s") as bus:
+        publisher = bus.publisher("ingest")
+        *messages, last = stream(200)
+        slow, fast = messages[0::6], messages[1::3]
+        for i in range(200):
+            publisher.put(slow[i // 10] if i % 10 == 0 else fast[i // 10])
+        subscription = bus.subscribe("record", ["ingest"])
+        thread = threading.Thread(target=collect, args=(subscription, received))
+        begin = time.monotonic()
+        thread.start()
+        publisher.put(last)
+        thread.join(30)
+    numbers = [m.sequence for m in received if m.sequence >= 0]
+    assert numbers == sorted(numbers)
+    assert len(numbers) < 60
+    assert numbers[-1] == 200
+    assert sum(b - a > 1 for a, b in pairwise(numbers)) > 5, "no gaps, no test"
+    assert told(received) == [f"bus: {201 - len(numbers)} messages of stage ingest never arrived"]
+    assert subscription.missing == 201 - len(numbers)
+    assert time.monotonic() - begin < 3
+
+
+def test_a_message_that_still_comes_is_not_given_up(monkeypatch):
+    """Only gaps before messages that have waited too long are given up, and a number that came twice counts once."""
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(bus_module, "time", clock)
+    order = bus_module._Order("ingest")
+    (message,) = stream(0)
+    for clock.now, number in enumerate([3, 2, 3, 7, 9]):
+        order.add("a", msgspec.structs.replace(message, sequence=number))
+    clock.now = bus_module.PATIENCE + 3.5
+    assert order.overdue() == 2 + 3
+    assert [m.sequence for m in order.ready()] == [2, 3, 7]
+    assert order.overdue() == 0
+    order.add("a", msgspec.structs.replace(message, sequence=8))
+    assert [m.sequence for m in order.ready()] == [8, 9]
+
+
+def test_many_messages_can_wait():
+    order = bus_module._Order("ingest")
+    (message,) = stream(0)
+    begin = time.monotonic()
+    for number in range(30000, -1, -1):
+        order.add("a", msgspec.structs.replace(message, sequence=number))
+    assert sum(1 for _ in order.ready()) == 30001
+    assert time.monotonic() - begin < 3
+
+
 def test_a_payload_that_is_no_message_is_refused_and_told():
     received: list = []
     with Bus("s") as bus:
@@ -190,6 +261,115 @@ def test_a_restarted_stage_is_told_apart():
     assert [m.sequence for m in received if m.source != "record"] == [0, 0, 1, 2]
 
 
+def test_what_waits_when_a_stage_is_restarted_is_told_as_lost():
+    received: list = []
+    with Bus("s") as bus:
+        subscription = bus.subscribe("record", ["ingest"])
+        thread = threading.Thread(target=collect, args=(subscription, received))
+        thread.start()
+        first = bus.publisher("ingest")
+        first.put(next(stream(1)))
+        first.sequence += 3
+        first.put(next(stream(1)))
+        wait_for(lambda: subscription._orders["ingest"].waiting)
+        publish(bus, "ingest", stream(2))
+        thread.join(30)
+    assert told(received) == ["bus: stage ingest was restarted; 4 messages of before are lost"]
+    assert subscription.missing == 4
+    assert [m.sequence for m in received if m.source != "record"] == [0, 0, 1, 2]
+
+
+ROOT = Path(__file__).parents[2]
+CARRIER = """
+import os, sys, time
+from telemetry.bus import Bus
+from tests.telemetry.test_bus import stream
+
+*messages, last = stream(30)
+bus = Bus("s", listen=[sys.argv[1]])
+publisher = bus.publisher("ingest")
+for message in messages:
+    publisher.put(message)
+if sys.stdin.readline():
+    publisher.put(last)
+    publisher.finish()
+os._exit(0)
+"""
+
+
+def test_a_consumer_outlives_the_process_that_carries_the_bus(port, monkeypatch):
+    monkeypatch.setattr(bus_module, "GRACE", 0.1)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    received: list = []
+    carriers = []
+
+    def carry():
+        command = [sys.executable, "-c", CARRIER, endpoint]
+        carriers.append(subprocess.Popen(command, stdin=subprocess.PIPE, text=True, cwd=ROOT))
+        return carriers[-1]
+
+    try:
+        carrier = carry()
+        with Bus("s", connect=[endpoint]) as bus:
+            thread = threading.Thread(target=collect, args=(bus.subscribe("record", ["ingest"]), received))
+            thread.start()
+            wait_for(lambda: len(received) == 30)
+            carrier.kill()
+            wait_for(lambda: len(received) == 31)
+            assert not bus.connected
+            assert not bus.publisher("estimate").finish(deadline=0.2), "who listens cannot be known"
+            carrier = carry()
+            wait_for(lambda: len(received) == 30 + 1 + 2 + 30)
+            assert thread.is_alive()
+            carrier.stdin.write("finish\n")
+            carrier.stdin.flush()
+            thread.join(30)
+            assert carrier.wait(30) == 0
+    finally:
+        for carrier in carriers:
+            carrier.kill()
+            carrier.communicate()
+    first, *others = told(received)
+    assert first == "bus: stage ingest is gone"
+    assert sorted(others) == ["bus: stage ingest is back", "bus: stage ingest was restarted"]
+    assert received[-1].final
+
+
+def test_a_stage_is_gone_only_before_its_last_word(port, monkeypatch):
+    monkeypatch.setattr(bus_module, "GRACE", 0.1)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    received: list = []
+    with Bus("s", listen=[endpoint]) as router:
+        subscription = router.subscribe("record", ["ingest", "estimate", "absent"])
+        thread = threading.Thread(target=collect, args=(subscription, received))
+        thread.start()
+        with Bus("s", connect=[endpoint]) as client:
+            assert publish(client, "ingest", stream(5))
+            client.publisher("estimate").put(next(stream(1)))
+            wait_for(lambda: len(received) == 7)
+        wait_for(lambda: told(received))
+        time.sleep(0.5)
+        subscription.stop()
+        thread.join(30)
+    assert told(received) == ["bus: stage estimate is gone"]
+
+
+def test_who_carries_the_bus_can_leave_last(port):
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with Bus("s", listen=[endpoint]) as router, Bus("s", connect=[endpoint]) as client:
+        own = router.publisher("ingest"), router.subscribe("watch", ["estimate"])
+        publisher = client.publisher("estimate")
+        subscription = client.subscribe("record", ["ingest"])
+        wait_for(lambda: len(router.tokens("alive/**")) == len(router.tokens("listening/**")) == 2)
+        assert not router.linger(0.2)
+        subscription.close()
+        wait_for(lambda: len(router.tokens("listening/**")) == 1)
+        assert not router.linger(0.2), "it may still have something to say"
+        assert publisher.finish()
+        assert router.linger(5)
+        assert own
+
+
 def test_a_stage_that_fails_says_so_and_ends():
     received: list = []
     with Bus("s") as bus:
@@ -205,4 +385,22 @@ def test_a_stage_that_fails_says_so_and_ends():
             publish(bus, "ingest", failing())
         thread.join(30)
     assert "stage ingest failed: the estimator broke" in received[1].text[0]
+    assert received[-1].final
+
+
+@pytest.mark.parametrize(("error", "expected"), [(RuntimeError(), "RuntimeError"), (KeyboardInterrupt(), None)])
+def test_a_stage_that_is_interrupted_ends_too(error, expected):
+    received: list = []
+    with Bus("s") as bus:
+        thread = threading.Thread(target=collect, args=(bus.subscribe("record", ["ingest"]), received))
+        thread.start()
+
+        def failing():
+            yield next(stream(1))
+            raise error
+
+        with pytest.raises(type(error)):
+            publish(bus, "ingest", failing())
+        thread.join(30)
+    assert told(received, "ingest") == ([f"stage ingest failed: {expected}"] if expected else [])
     assert received[-1].final

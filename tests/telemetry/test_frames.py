@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from itertools import pairwise
+from pathlib import Path
 
 import fastcrc
 import numpy as np
@@ -10,18 +12,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from telemetry.frames import STX1, STX2, TlogScanner, join, scan_datagrams, write_junk, write_record
+from telemetry.archive import RawLog
+from telemetry.frames import DAY, STX1, STX2, Frames, TlogScanner, join, scan_datagrams, write_junk, write_record
 from telemetry.mavlink import Dialect
 from tests.telemetry.wire import DATA, LOGS, Sender, tlog
 
 DIALECT = Dialect()
 
 
-def scan(*datagrams: bytes):
+US = 1_700_000_000_000_000
+
+
+def scan(*datagrams: bytes, links: int = 1):
     data = np.frombuffer(b"".join(datagrams), np.uint8)
     bounds = np.cumsum([0] + [len(d) for d in datagrams])
-    t_rx = 1_000_000 * np.arange(1, len(datagrams) + 1)
-    return scan_datagrams(data, bounds, t_rx, np.zeros(len(datagrams), np.uint8), DIALECT.crc_extra)
+    count = np.arange(len(datagrams))
+    return scan_datagrams(data, bounds, 1_000_000 * (count + 1), (count % links).astype(np.uint8), DIALECT.crc_extra)
 
 
 def read(log: bytes, cuts: list[int] | None = None, links: int = 1):
@@ -154,14 +160,126 @@ def test_a_log_reads_the_same_however_it_is_cut(parts, cuts, missing):
     assert sum(b.junk_corrupt.sum() for b in pieces_) == sum(b.junk_corrupt.sum() for b in whole)
 
 
-@pytest.mark.parametrize("byte", [0xFD, 0xFE])
-def test_a_start_byte_anywhere_in_a_time_changes_nothing(byte):
+def archived(batch: Frames, links: int) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        log = RawLog(Path(folder) / "raw.tlog", links=links)
+        log.write(batch)
+        log.close()
+        return log.path.read_bytes()
+
+
+def evidence(batch: Frames) -> tuple:
+    """All that a batch says, in Python's types."""
+    frames = [
+        (batch.frame(i), *(int(getattr(batch, name)[i]) for name in ("msgid", "link", "seq", "known", "t_rx")))
+        for i in range(len(batch))
+    ]
+    junk = [
+        (batch.junk(i), *(int(getattr(batch, name)[i]) for name in ("junk_t_rx", "junk_link", "junk_corrupt")))
+        for i in range(len(batch.junk_start))
+    ]
+    return frames, junk
+
+
+# Whole, cut and damaged frames of known and unknown ids, and noise that looks like the beginning of one or of a record.
+arrivals = st.lists(
+    st.one_of(
+        st.builds(lambda ms: Sender(seq=ms % 256).attitude(ms), st.integers(0, 1000)),
+        st.builds(lambda seq: Sender(seq=seq).unknown(), st.integers(0, 255)),
+        st.builds(lambda ms, n: Sender().attitude(ms)[:n], st.integers(0, 1000), st.integers(1, 27)),
+        st.builds(lambda n: b"\xfd\x10\x00\x00\x01\x01\x1e\x00" + bytes(n), st.integers(0, 40)),
+        st.sampled_from([b"\xfd", b"\xfe", b"\xfe\x09\x00", b"\x00junk\xff\xff", bytes(8) + b"\x00junk\x02\x00"]),
+        st.binary(min_size=1, max_size=40),
+    ),
+    min_size=1,
+    max_size=4,
+).map(b"".join)
+
+
+@given(st.lists(arrivals, min_size=1, max_size=8), st.integers(1, 4), st.lists(st.integers(0, 900), max_size=6))
+@settings(max_examples=300, deadline=None)
+def test_our_archive_reads_as_what_arrived_however_it_is_cut(datagrams, links, cuts):
+    live = scan(*datagrams, links=links)
+    log = archived(live, links)
+    replay = read(log, [min(c, len(log)) for c in cuts], links)
+    whole = join(replay)
+    assert evidence(whole) == evidence(live)
+    assert (whole.discarded, whole.pending, whole.until) == (live.discarded, 0, live.until)
+    assert whole.headers == 8 * len(live) + 15 * len(live.junk_start)
+    for before, after in pairwise(replay):
+        assert before.until <= after.until
+        assert (after.t_rx > before.until).all()
+        assert (after.junk_t_rx > before.until).all()
+
+
+def test_every_cut_inside_a_junk_record_waits_for_the_rest():
     sender = Sender()
-    frames = []
-    for place in range(2, 8):
-        us = int.from_bytes(bytes(byte if i == place else min(i, 6) for i in range(8)), "big")
-        frames.append((us, sender.attitude(place)))
+    log = write_record(US, sender.unknown()) + write_junk(US + 4, b"rubbish") + write_record(US + 8, sender.attitude(2))
+    whole = evidence(join(read(log)))
+    assert [len(part) for part in whole] == [2, 1]
+    for cut in range(len(log)):
+        found = join(read(log, [cut]))
+        assert evidence(found) == whole
+        assert (found.headers, found.pending) == (8 + 15 + 8, 0)
+
+
+def test_a_batch_of_nothing_but_junk_moves_time_on():
+    log = write_record(US, Sender().attitude(1)) + write_junk(US + 1000, b"noise") + write_junk(US + 2000, b"noise")
+    first, middle, last = read(log, [len(log) - 40, len(log) - 10])
+    assert first.until == US * 1000 - 1
+    assert middle.until == (US + 1000) * 1000 - 1
+    assert last.until == (US + 2000) * 1000
+
+
+@pytest.mark.parametrize("byte", [0xFD, 0xFE])
+@pytest.mark.parametrize("place", range(2, 8))
+def test_a_start_byte_anywhere_in_a_time_changes_nothing(byte, place):
+    us = int.from_bytes(bytes(byte if i == place else min(i, 6) for i in range(8)), "big")
+    frames = [(us, Sender().attitude(place))]
     assert frames_of(read(tlog(frames))) == frames
+
+
+@given(
+    st.lists(st.sampled_from(["frame", "unknown", "junk"]), min_size=3, max_size=8),
+    st.data(),
+    st.lists(st.integers(0, 400), max_size=6),
+)
+@settings(max_examples=300, deadline=None)
+def test_one_flipped_bit_in_a_time_dates_nothing_else(kinds, data, cuts):
+    sender = Sender()
+    records = [
+        write_junk(US + 1000 * i, b"rubbish")
+        if kind == "junk"
+        else write_record(US + 1000 * i, sender.attitude(i) if kind == "frame" else sender.unknown())
+        for i, kind in enumerate(kinds)
+    ]
+    hit = data.draw(st.integers(1, len(kinds) - 1))
+    us = US + 1000 * hit ^ 1 << data.draw(st.integers(0, 63))
+    clean = join(read(b"".join(records)))
+    records[hit] = us.to_bytes(8, "big") + records[hit][8:]
+    log = b"".join(records)
+    found = join(read(log, [min(c, len(log)) for c in cuts]))
+    assert (len(found), found.discarded, found.headers) == (len(clean), clean.discarded, clean.headers)
+    expected = us if abs(us - US - 1000 * (hit - 1)) < DAY else US + 1000 * (hit - 1)
+    times = [t // 1000 for t in sorted([*found.t_rx.tolist(), *found.junk_t_rx.tolist()])]
+    assert times == sorted(expected if i == hit else US + 1000 * i for i in range(len(kinds)))
+
+
+@pytest.mark.parametrize("step", [-50 * 365 * DAY, -2 * DAY, 2 * DAY, 50 * 365 * DAY])
+def test_a_lasting_step_of_the_recorders_clock_is_kept(step):
+    sender = Sender()
+    frames = [(US + 1000 * i + (step if i >= 3 else 0), sender.attitude(i)) for i in range(6)]
+    log = tlog(frames)
+    for cut in range(len(log)):
+        assert frames_of(read(log, [cut])) == frames
+
+
+def test_a_damaged_time_keeps_its_link():
+    sender = Sender()
+    times = [US, US + 4 + 1 + (1 << 50), US + 8]
+    found = join(read(tlog([(us, sender.attitude(i)) for i, us in enumerate(times)]), links=2))
+    assert found.t_rx.tolist() == [US * 1000, US * 1000, (US + 8) * 1000]
+    assert found.link.tolist() == [0, 1, 0]
 
 
 def test_a_time_that_is_none_does_not_lose_its_frame():
@@ -202,9 +320,19 @@ def test_our_own_archive_keeps_what_was_no_frame_with_its_time():
 
 def test_link_numbers_travel_in_the_two_lowest_bits_when_the_log_says_so():
     frame = Sender().attitude(1)
-    found = join(read(tlog([(4000, frame), (4007, frame)]), links=2))
+    found = join(read(tlog([(4000, frame), (4007, frame)]), links=4))
     assert found.link.tolist() == [0, 3]
     assert found.t_rx.tolist() == [4_000_000, 4_004_000]
+
+
+def test_a_link_number_beyond_the_links_is_damage():
+    log = (
+        write_record(4003, Sender().attitude(1)) + write_junk(8002, b"rubbish") + write_record(8005, Sender().unknown())
+    )
+    found = join(read(log, links=2))
+    assert found.link.tolist() == [0, 1]
+    assert found.junk_link.tolist() == [0]
+    assert found.t_rx.tolist() == [4_000_000, 8_004_000]
 
 
 def test_joined_batches_are_one():
@@ -214,6 +342,22 @@ def test_joined_batches_are_one():
     assert [whole.frame(i) for i in range(3)] == [b.frame(0) for b in batches]
     assert [whole.junk(i) for i in range(3)] == [b"junk"] * 3
     assert whole.select(np.array([2])).frame(0) == batches[2].frame(0)
+
+
+@given(st.lists(arrivals, min_size=1, max_size=6), st.data())
+@settings(max_examples=100, deadline=None)
+def test_compact_frames_are_the_same_over_bytes_of_their_own(datagrams, data):
+    batch = scan(*datagrams, links=2)
+    rows = data.draw(
+        st.lists(st.sampled_from(range(len(batch))), unique=True).map(sorted) if len(batch) else st.just([])
+    )
+    chosen = batch.select(np.array(rows, np.int64))
+    found = chosen.compact()
+    assert evidence(found) == evidence(chosen)
+    assert found.checksum().tolist() == chosen.checksum().tolist()
+    assert found.until == batch.until
+    assert found.data.base is None
+    assert len(found.data) == int(chosen.length.sum())
 
 
 @pytest.mark.parametrize("name", LOGS)
