@@ -52,6 +52,14 @@ def from_earth(earth: Floats) -> tuple[Floats, Floats, Floats]:
     return latitude, np.arctan2(y, x), height
 
 
+def axes(latitude: Floats, longitude: Floats) -> Floats:
+    """North, east and down at places (...), as Earth-fixed rows: shape (3, 3, ...)."""
+    sin, cos, sin_l, cos_l = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
+    return np.array(
+        [[-sin * cos_l, -sin * sin_l, cos], [-sin_l, cos_l, np.zeros_like(sin)], [-cos * cos_l, -cos * sin_l, -sin]]
+    )
+
+
 def _rotate(matrix: Floats, vectors: Floats) -> Floats:
     """Matrix times vectors (..., 3), term by term: a matrix product rounds otherwise for one vector than for many."""
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
@@ -70,15 +78,22 @@ class TangentPlane:
     def __init__(self, latitude: float, longitude: float, height: float) -> None:
         self.latitude, self.longitude, self.height = latitude, longitude, height
         self._point = to_earth(np.array(latitude), np.array(longitude), np.array(height))
-        sin, cos, sin_l, cos_l = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
-        self._axes = np.array(
-            [[-sin * cos_l, -sin * sin_l, cos], [-sin_l, cos_l, 0.0], [-cos * cos_l, -cos * sin_l, -sin]]
-        )
+        self._axes = axes(np.array(latitude), np.array(longitude))
 
     def to_plane(self, latitude: Floats, longitude: Floats, height: Floats) -> tuple[Floats, Floats]:
         """North and east, m, of points at their heights."""
         local = _rotate(self._axes, to_earth(latitude, longitude, height) - self._point)
         return local[..., 0], local[..., 1]
+
+    def turn(self, latitude: Floats, longitude: Floats, velocity: Floats) -> tuple[Floats, Floats]:
+        """North and east in the plane, m/s, of velocities (k, 3) along north, east and down of where they were
+        measured. A vertical part that is not known (NaN) is taken for zero.
+        """
+        there = axes(latitude, longitude)
+        parts = velocity[:, 0], velocity[:, 1], np.where(np.isnan(velocity[:, 2]), 0.0, velocity[:, 2])
+        x, y, z = (parts[0] * there[0, i] + parts[1] * there[1, i] + parts[2] * there[2, i] for i in range(3))
+        north, east = (row[0] * x + row[1] * y + row[2] * z for row in self._axes[:2])
+        return north, east
 
     def from_plane(self, north: Floats, east: Floats, height: Floats) -> tuple[Floats, Floats]:
         """Latitude and longitude, rad, of points at their heights: the inverse of `to_plane`."""

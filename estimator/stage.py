@@ -2,7 +2,8 @@
 
 The only file of the room that knows the vocabulary. Per vehicle and boot epoch it orders the samples, filters them as
 they become complete, closes windows, and smooths what has closed. Nothing crosses a boot: a new epoch begins from the
-prior.
+prior. So does a new leg of the same epoch, where the clock stepped, a silence or a distance was too long, or the filter
+failed.
 """
 
 from __future__ import annotations
@@ -11,25 +12,29 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.arrivals import Arrivals, Place
 from estimator.information import Carry, anchor, filter, start
 from estimator.model import LinearModel
 from estimator.models import trajectory
 from estimator.models.trajectory import Trajectory
 from estimator.smoother import backward
 from estimator.snapshots import Store
-from estimator.synchronise import Rows, Steps, Synchroniser
+from estimator.synchronise import MARK, Rows, Steps, Synchroniser, concatenate, take
 from estimator.window import Rule
 from telemetry.messages import Altitude, Estimate, Event, Gnss, Mark, Message, Progress, Window, event
 
 SENSORS = ("gnss", "altitude")
+GNSS, ALTITUDE = range(len(SENSORS))
 STAGE = "estimate"
+Seconds = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
 Scope = Literal["window", "sortie"]
+Level = Literal["info", "warning", "error"]
 Reason = Literal["mark", "gap", "length", "reboot", "end"]
 
 
@@ -45,17 +50,17 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     gap : float
         A silence longer than this closes the window, s.
     window : float
-        Longest window between test points, s.
+        Longest window between test points, s, from its first measurement; a silence is never cut by it.
     test_point : float
-        Longest test point, s; one that is never stopped closes then.
+        Longest window of a test point, s; one that lasts longer is cut there and goes on under the same name.
     trajectory : estimator.models.trajectory.Settings
     """
 
-    lag: float = 0.3
-    grid: float = 0.5
-    gap: float = 3.0
-    window: float = 30.0
-    test_point: float = 600.0
+    lag: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.3
+    grid: Seconds = 0.5
+    gap: Seconds = 3.0
+    window: Seconds = 30.0
+    test_point: Seconds = 600.0
     trajectory: trajectory.Settings = trajectory.Settings()
 
 
@@ -70,8 +75,8 @@ def estimate(
         The output of `telemetry.ingest.ingest`.
     settings : Settings, optional
     scope : {"window", "sortie"}
-        What a window's smoothing knows: everything up to its closing, told when it closes; or the whole boot epoch,
-        told when that ends.
+        What a window's smoothing knows: everything up to its closing, told when it closes; or the whole leg, in
+        general the boot epoch, told when that ends.
 
     Yields
     ------
@@ -124,32 +129,136 @@ def warm_up() -> None:
 class _Open:
     """The window that is being flown."""
 
-    first: int  # index of its first step in the store
-    test_point: str = ""
+    test_point: str
+    digest: Any
+    begin: int | None = None  # time of its first measurement
     t: list[NDArray[np.int64]] = field(default_factory=list)
     t_rx: list[NDArray[np.int64]] = field(default_factory=list)
     used: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(SENSORS), np.int64))
     nis: float = 0.0
     dof: int = 0
     anchors: int = 0
-    digest: Any = None
-
-    @property
-    def begin(self) -> int:
-        return int(self.t[0][0])
 
     def __len__(self) -> int:
         return sum(len(t) for t in self.t)
 
 
 class _Epoch:
-    """One boot epoch of one vehicle."""
+    """One boot epoch of one vehicle: its arrivals, and the leg that is being flown."""
 
     def __init__(self, vehicle: int, boot: int, settings: Settings, scope: Scope) -> None:
         self.heard = np.iinfo(np.int64).max  # receive time of the first message
-        self._vehicle, self._boot, self._settings, self._scope = vehicle, boot, settings, scope
-        self._taken: list[Message] = []
-        self._model: Trajectory | None = None
+        self.vehicle, self.boot, self.settings, self.scope = vehicle, boot, settings, scope
+        self._lag = round(settings.lag * 1e9)
+        self._arrivals = Arrivals(SENSORS, GNSS, lag=self._lag)
+        self.marks: list[tuple[str, str]] = []  # action and name
+        self._leg: _Leg | None = None
+        self._number, self._test_point = 0, ""  # of the next leg's first window
+        self._begun = False
+        self._samples, self._t, self._t_rx = 0, np.iinfo(np.int64).min, np.iinfo(np.int64).min
+
+    def take(self, message: Message) -> None:
+        """Take a message in; nothing happens before its receive time has been covered."""
+        self.heard = min(self.heard, int(message.t_rx.min()))
+        self._samples += len(message.t)
+        self._t, self._t_rx = max(self._t, int(message.t.max())), max(self._t_rx, int(message.t_rx.max()))
+        k = len(message.t)
+        z, r = np.full((k, trajectory.M), np.nan), np.ones((k, trajectory.M))
+        if isinstance(message, Mark):
+            sensor = MARK
+            z[:, 0] = len(self.marks) + np.arange(k)
+            self.marks += zip(message.action, message.name, strict=True)
+        elif isinstance(message, Gnss):
+            sensor = GNSS
+            z[:, :3] = np.stack([message.latitude, message.longitude, message.altitude], axis=1)
+            z[:, 3:6] = message.velocity
+            r[:, :3] = message.sigma
+        else:
+            assert isinstance(message, Altitude)
+            sensor = ALTITUDE
+            z[:, 0], r[:, 0] = message.altitude, message.sigma
+        self._arrivals.push(Rows(message.t, message.t_rx, np.full(k, sensor), z, r))
+
+    def advance(self, until: int, end: Reason | None = None) -> Iterator[Message]:
+        """Filter what is complete, and tell the windows that close on the way."""
+        rows = self._arrivals.covered(until)
+        while rows is not None and len(rows.t):
+            piece = self._arrivals.judge(rows, end is not None)
+            rows = piece.rest
+            failed = len(piece.judged.t)  # nowhere
+            if piece.origin is not None:
+                self._leg = self._begin(piece.origin)
+                fix = int(np.flatnonzero(piece.rows.sensor == GNSS)[0])
+                yield self.event(
+                    "info",
+                    f"trajectory model from satellite fixes and altimeter, origin "
+                    f"{np.rad2deg(piece.origin[0]):.5f} {np.rad2deg(piece.origin[1]):.5f} deg, "
+                    f"{piece.origin[2]:.0f} m",
+                    int(piece.rows.t[fix]),
+                    int(piece.rows.t_rx[fix]),
+                )
+            if self._leg is not None:
+                try:
+                    yield from self._leg.advance(piece.rows, until)
+                    if piece.over:
+                        yield from self._end(self._leg, "gap", until)
+                except (ValueError, ArithmeticError) as error:
+                    failed = piece.row(self._leg.at + self._lag)
+                    yield from self._fail(self._leg, error)
+                    rows = concatenate([take(piece.judged, np.arange(failed + 1, len(piece.judged.t))), rows])
+            for note in piece.notes:
+                if note.row <= failed:  # what came after is judged anew
+                    yield self.event("warning", note.text, note.t, note.t_rx)
+
+    def finish(self, until: int, reason: Reason) -> Iterator[Message]:
+        """Let everything out and close the last window."""
+        yield from self.advance(until, reason)
+        if self._leg is not None:
+            try:
+                yield from self._end(self._leg, reason, until)
+            except (ValueError, ArithmeticError) as error:
+                assert self._leg is not None
+                yield from self._fail(self._leg, error)
+        if not self._begun:
+            text = f"no satellite fix in boot {self.boot}: nothing to estimate from {self._samples} samples"
+            yield self.event("warning", text, self._t, self._t_rx)
+
+    def _begin(self, origin: Place) -> _Leg:
+        self._begun = True
+        model = Trajectory(*origin, self.settings.trajectory)
+        return _Leg(self, model, self._number, self._test_point)
+
+    def _end(self, leg: _Leg, reason: Reason, until: int) -> Iterator[Message]:
+        yield from leg.finish(reason, until)
+        self._leg, self._number, self._test_point = None, leg.number, leg.test_point
+
+    def _fail(self, leg: _Leg, error: Exception) -> Iterator[Message]:
+        """Tell of an error, and what is left of the leg; the next fix begins another."""
+        self._arrivals.forget()
+        text = f"the estimate of vehicle {self.vehicle}, boot {self.boot} failed and begins anew: {error}"
+        yield self.event("error", text, leg.at, leg.at_rx)
+        try:
+            yield from leg.close("gap", leg.at)  # what was late after that counts in the next leg
+            yield from leg.smooth()
+        except (ValueError, ArithmeticError):
+            pass  # told already: the window is lost
+        self._leg, self._number, self._test_point = None, leg.number, leg.test_point
+
+    def event(self, level: Level, text: str, t: int, t_rx: int) -> Event:
+        return event(text, level=level, vehicle=self.vehicle, source=STAGE, boot=self.boot, t=t, t_rx=t_rx)
+
+
+class _Leg:
+    """A stretch of an epoch that one filter flies.
+
+    `number` and `test_point` are those of the window being flown, `at` and `at_rx` the times of the step at hand.
+    """
+
+    def __init__(self, epoch: _Epoch, model: Trajectory, number: int, test_point: str) -> None:
+        self._epoch, self._model = epoch, model
+        self.number = number
+        self.at = self.at_rx = 0
+        settings = self._settings = epoch.settings
         self._synchroniser = Synchroniser(
             len(SENSORS), trajectory.M, lag=round(settings.lag * 1e9), grid=round(settings.grid * 1e9)
         )
@@ -157,128 +266,107 @@ class _Epoch:
         self._late: list[tuple[int, int]] = []
         self._rule = Rule(scale=np.array(trajectory.SCALE))
         self._store = Store()
-        self._carry: Carry = start(trajectory.N)
-        self._std = np.full(trajectory.N, np.inf)
+        self._carry: Carry = start(trajectory.N, model.x0, model.p0)
+        self._std = self._std_measured = np.full(trajectory.N, np.inf)  # after the last step, and the last measured one
         self._configuration = msgspec.json.encode(settings)
-        self._number = 0
-        self._closed: list[Window] = []  # waiting for the end of the epoch
-        self._window = self._open(0, "")
+        self._closed: list[Window] = []  # waiting for the end of the leg
+        self._released = np.empty(0, np.int64)  # times of the measurements at hand
+        self._window = self._open(test_point)
 
-    def take(self, message: Message) -> None:
-        """Take a message in; nothing happens before its receive time has been covered."""
-        self.heard = min(self.heard, int(message.t_rx.min()))
-        self._taken.append(message)
+    @property
+    def test_point(self) -> str:
+        return self._window.test_point
 
-    def advance(self, until: int, final: bool = False) -> Iterator[Message]:
+    def advance(self, rows: Rows, until: int) -> Iterator[Message]:
         """Filter what is complete, and tell the windows that close on the way."""
-        if self._model is None:
-            yield from self._begin(until)
-        if self._model is None:
-            return
-        for message in self._taken:
-            self._push(message, self._model)
-        self._taken = []
+        model = self._model
+        marks = take(rows, rows.sensor == MARK)
+        for t, t_rx, number in zip(marks.t, marks.t_rx, marks.z[:, 0], strict=True):
+            self._synchroniser.mark(int(t), int(t_rx))
+            self._marks.append(self._epoch.marks[int(number)])
+        fixes, heights = take(rows, rows.sensor == GNSS), take(rows, rows.sensor == ALTITUDE)
+        z, r = model.gnss(fixes.z[:, 0], fixes.z[:, 1], fixes.z[:, 2], fixes.z[:, 3:6], fixes.r[:, :3])
+        self._synchroniser.push(fixes._replace(z=z, r=r))
+        z, r = model.altimeter(heights.z[:, 0], heights.r[:, 0])
+        self._synchroniser.push(heights._replace(z=z, r=r))
+        yield from self._release(until, False)
+
+    def finish(self, reason: Reason, until: int) -> Iterator[Message]:
+        """Let everything out and close the last window."""
+        yield from self._release(until, True)
+        yield from self.close(reason, np.iinfo(np.int64).max)
+        yield from self.smooth()
+
+    def _release(self, until: int, final: bool) -> Iterator[Message]:
         steps = self._synchroniser.release(until, final)
         self._late += steps.late
-        yield from self._walk(steps, self._model)
-
-    def finish(self, until: int, reason: Reason) -> Iterator[Message]:
-        """Let everything out and close the last window."""
-        yield from self.advance(until, final=True)
-        if self._model is None:
-            samples = sum(len(m.t) for m in self._taken)
-            yield self._event(
-                "warning",
-                f"no satellite fix in boot {self._boot}: nothing to estimate from {samples} samples",
-                int(self._taken[-1].t[-1]),
-                int(self._taken[-1].t_rx[-1]),
-            )
-            return
-        yield from self._close(reason, np.iinfo(np.int64).max)
-        yield from self._smooth_epoch()
-
-    # -- samples -------------------------------------------------------------------------------------------------------
-
-    def _begin(self, until: int) -> Iterator[Event]:
-        """Found the model on the first fix: its place is the origin."""
-        fixes = [
-            (int(m.t_rx[0]), int(m.t[0]), i)
-            for i, m in enumerate(self._taken)
-            if isinstance(m, Gnss) and m.t_rx[0] <= until
-        ]
-        if not fixes:
-            return
-        t_rx, t, index = min(fixes)
-        fix = self._taken[index]
-        assert isinstance(fix, Gnss)
-        place = float(fix.latitude[0]), float(fix.longitude[0]), float(fix.altitude[0])
-        self._model = Trajectory(*place, self._settings.trajectory)
-        self._carry = start(trajectory.N, self._model.x0, self._model.p0)
-        self._taken = [m for m in (_since(m, t_rx) for m in self._taken) if m is not None]
-        yield self._event(
-            "info",
-            f"trajectory model from satellite fixes and altimeter, origin "
-            f"{np.rad2deg(place[0]):.5f} {np.rad2deg(place[1]):.5f} deg, {place[2]:.0f} m",
-            t,
-            t_rx,
-        )
-
-    def _push(self, message: Message, model: Trajectory) -> None:
-        if isinstance(message, Mark):
-            for t, t_rx, action, name in zip(message.t, message.t_rx, message.action, message.name, strict=True):
-                self._synchroniser.mark(int(t), int(t_rx))
-                self._marks.append((action, name))
-            return
-        if isinstance(message, Gnss):
-            z, r = model.gnss(message.latitude, message.longitude, message.altitude, message.velocity, message.sigma)
-            sensor = 0
-        else:
-            assert isinstance(message, Altitude)
-            z, r = model.altimeter(message.altitude, message.sigma)
-            sensor = 1
-        self._synchroniser.push(Rows(message.t, message.t_rx, np.full(len(message.t), sensor), z, r))
+        yield from self._walk(steps)
 
     # -- windows -------------------------------------------------------------------------------------------------------
 
-    def _walk(self, steps: Steps, model: Trajectory) -> Iterator[Message]:
+    def _walk(self, steps: Steps) -> Iterator[Message]:
         """Filter the steps, stopping wherever a window closes."""
         t = steps.t
         quiet = steps.silence > self._settings.gap
         quiet[1:] &= ~steps.silent[:-1]  # only the first step of a silence
         silences = np.flatnonzero(quiet)
+        measured = np.flatnonzero(~steps.silent)  # a silence is released with the step that ends it
+        self._released = t[measured]
         marks = list(steps.marks)
         i = 0
         while i < len(t) or marks:
             longest = self._settings.test_point if self._window.test_point else self._settings.window
-            begin = self._window.begin if len(self._window) else int(t[i]) if i < len(t) else 0
+            begin = self._window.begin
+            if begin is None and i < len(t):
+                begin = int(t[measured[np.searchsorted(measured, i)]])
             later = silences[silences >= i + (len(self._window) == 0)]
             cuts: list[tuple[int, Reason]] = [(len(t), "end")]
             if len(later):
                 cuts.append((int(later[0]), "gap"))
-            cuts.append((int(np.searchsorted(t, begin + round(longest * 1e9), "right")), "length"))
+            if begin is not None:
+                over = int(np.searchsorted(t, begin + round(longest * 1e9), "right"))
+                if over < len(t) and over > i and steps.silent[over - 1]:  # not in a silence: after it
+                    over = int(measured[np.searchsorted(measured, over)]) + 1
+                cuts.append((over, "length"))
             if marks:
                 cuts.append((int(np.searchsorted(t, marks[0][0], "right")), "mark"))
             order: dict[Reason, int] = {"mark": 0, "gap": 1, "length": 2, "end": 3}
             cut, reason = min(cuts, key=lambda c: (max(c[0], i), order[c[1]]))
             cut = max(cut, i)
             if cut > i:
-                yield from self._filter(_rows(steps, i, cut), model)
+                yield from self._filter(steps.cut(i, cut))
                 i = cut
             if reason == "mark":
                 when, number = marks.pop(0)
                 yield from self._mark(when, *self._marks[number])
             elif cut < len(t):
-                yield from self._close(reason, int(t[cut]))
+                self.at, self.at_rx = int(t[measured[np.searchsorted(measured, cut)]]), int(steps.t_rx[cut])
+                yield from self.close(reason, int(t[cut]))
 
-    def _filter(self, steps: Steps, model: Trajectory) -> Iterator[Message]:
+    def _filter(self, steps: Steps) -> Iterator[Message]:
         if len(steps.t) in (trajectory.M, trajectory.P):  # variances by rows could be taken for a covariance
-            yield from self._filter(_rows(steps, 0, 1), model)
-            steps = _rows(steps, 1, len(steps.t))
-        phi, gamma, q = model.transition(steps.dt)
+            yield from self._filter(steps.cut(0, 1))
+            steps = steps.cut(1, len(steps.t))
+        phi, gamma, q = self._model.transition(steps.dt)
         before = len(self._store.anchors)
-        chunk = LinearModel(phi, gamma, q, model.observation(steps.r), steps.r)
-        self._carry, live = filter(chunk, self._carry, steps.z, rule=self._rule, store=self._store)
+        chunk = LinearModel(phi, gamma, q, self._model.observation(steps.r), steps.r)
+        try:
+            self._carry, live = filter(chunk, self._carry, steps.z, rule=self._rule, store=self._store)
+        except (ValueError, ArithmeticError):
+            if len(steps.t) == 1:
+                self.at, self.at_rx = (
+                    int(self._released[np.searchsorted(self._released, steps.t[0])]),
+                    int(steps.t_rx[0]),
+                )
+                raise
+            half = len(steps.t) // 2  # up to the step that fails, everything is as if it had come alone
+            yield from self._filter(steps.cut(0, half))
+            yield from self._filter(steps.cut(half, len(steps.t)))
+            return
         window = self._window
+        measured = np.flatnonzero(~steps.silent)
+        if window.begin is None and len(measured):
+            window.begin = int(steps.t[measured[0]])
         window.t.append(steps.t)
         window.t_rx.append(steps.t_rx)
         window.used += steps.used.sum(axis=0)
@@ -288,9 +376,9 @@ class _Epoch:
         window.anchors += len(self._store.anchors) - before
         window.digest.update(np.column_stack([steps.t.view(np.float64), steps.z, steps.r]).tobytes())
         yield Estimate(
-            vehicle=self._vehicle,
+            vehicle=self._epoch.vehicle,
             source=STAGE,
-            boot=self._boot,
+            boot=self._epoch.boot,
             t=steps.t,
             t_rx=steps.t_rx,
             model=trajectory.MODEL,
@@ -300,21 +388,23 @@ class _Epoch:
             std=live.std,
             nis=live.nis,
             dof=live.dof,
-            geodetic=model.geodetic(live.mean),
+            geodetic=self._model.geodetic(live.mean),
         )
         yield from self._tell_gaps(steps, live.std)
         self._std = live.std[-1]
+        if len(measured):
+            self._std_measured = live.std[measured[-1]]
 
     def _tell_gaps(self, steps: Steps, std: NDArray[np.float64]) -> Iterator[Event]:
         """What each silence did to the uncertainty."""
-        ends = np.flatnonzero((steps.silence > self._settings.gap) & ~steps.silent)
-        for end in ends:
-            first = int(end)
-            while first > 0 and steps.silent[first - 1]:
-                first -= 1
-            before = std[first - 1] if first > 0 else self._std
-            worst = std[end - 1] if end > first else std[end]
-            yield self._event(
+        measured = np.flatnonzero(~steps.silent)
+        for end in np.flatnonzero((steps.silence > self._settings.gap) & ~steps.silent).tolist():
+            last = int(np.searchsorted(measured, end)) - 1
+            before = std[measured[last]] if last >= 0 else self._std_measured
+            worst = std[end]
+            if steps.dt[end] < steps.silence[end]:  # steps were put in: the last of them
+                worst = std[end - 1] if end > 0 else self._std
+            yield self._epoch.event(
                 "warning",
                 f"{steps.silence[end]:.1f} s without a measurement: std(north) {before[0]:.1f} -> "
                 f"{worst[0]:.1f} m, std(altitude) {before[4]:.1f} -> {worst[4]:.1f} m",
@@ -325,42 +415,44 @@ class _Epoch:
     def _mark(self, when: int, action: str, name: str) -> Iterator[Message]:
         if action == "stop" and self._window.test_point != name:
             t_rx = int(self._window.t_rx[-1][-1]) if len(self._window) else when
-            yield self._event("warning", f"test point {name} stopped without having been started: ignored", when, t_rx)
+            yield self._epoch.event(
+                "warning", f"test point {name} stopped without having been started: ignored", when, t_rx
+            )
             return
         if action == "start" and self._window.test_point == name:
             return  # said twice
-        yield from self._close("mark", when)
+        yield from self.close("mark", when)
         self._window.test_point = name if action == "start" else ""
 
-    def _open(self, first: int, test_point: str) -> _Open:
-        return _Open(first, test_point, digest=hashlib.sha256(self._configuration))
+    def _open(self, test_point: str) -> _Open:
+        return _Open(test_point, hashlib.sha256(self._configuration))
 
-    def _close(self, reason: Reason, when: int) -> Iterator[Window]:
+    def close(self, reason: Reason, when: int) -> Iterator[Window]:
         """Close the window at time `when` (of the step or mark that closed it) and begin the next one."""
         window = self._window
-        late = Counter(SENSORS[sensor] for t, sensor in self._late if t <= when)
-        self._late = [item for item in self._late if item[0] > when]
         if not len(window):
             return
+        late = Counter(SENSORS[sensor] for t, sensor in self._late if t <= when)
+        self._late = [item for item in self._late if item[0] > when]
         closed = self._message(window, reason, dict(late))
-        if self._scope == "window":
+        if self._epoch.scope == "window":
             mean, std = backward(self._store, self._carry, covariance=False)
             yield self._smoothed(closed, mean[1:], std[1:])
             self._store.drop(len(self._store))
         else:
             self._closed.append(closed)
         self._carry = anchor(self._carry)
-        self._number += 1
+        self.number += 1
         # A test point that a silence or its length cuts in two stays one until it is stopped.
-        self._window = self._open(len(self._store), window.test_point if reason in ("gap", "length") else "")
+        self._window = self._open(window.test_point if reason in ("gap", "length") else "")
 
     def _message(self, window: _Open, reason: Reason, late: dict[str, int]) -> Window:
         t, t_rx = np.concatenate(window.t), np.concatenate(window.t_rx)
         nothing = np.full((len(t), trajectory.N), np.nan)
         return Window(
-            vehicle=self._vehicle,
+            vehicle=self._epoch.vehicle,
             source=STAGE,
-            boot=self._boot,
+            boot=self._epoch.boot,
             t=t,
             t_rx=t_rx,
             model=trajectory.MODEL,
@@ -369,10 +461,10 @@ class _Epoch:
             mean=nothing,
             std=nothing,
             geodetic=np.full((len(t), 3), np.nan),
-            number=self._number,
+            number=self.number,
             test_point=window.test_point,
             reason=reason,
-            scope=self._scope,
+            scope=self._epoch.scope,
             measurements=dict(zip(SENSORS, window.used.tolist(), strict=True)),
             late=late,
             anchors=window.anchors,
@@ -381,8 +473,8 @@ class _Epoch:
             digest=window.digest.hexdigest(),
         )
 
-    def _smooth_epoch(self) -> Iterator[Window]:
-        """One smoothing of the whole epoch, told window by window."""
+    def smooth(self) -> Iterator[Window]:
+        """One smoothing of the whole leg, told window by window."""
         if not self._closed:
             return
         mean, std = backward(self._store, self._carry, covariance=False)
@@ -395,37 +487,4 @@ class _Epoch:
         self._store.drop(len(self._store))
 
     def _smoothed(self, closed: Window, mean: NDArray[np.float64], std: NDArray[np.float64]) -> Window:
-        assert self._model is not None
         return msgspec.structs.replace(closed, mean=mean, std=std, geodetic=self._model.geodetic(mean))
-
-    def _event(self, level: Literal["info", "warning", "error"], text: str, t: int, t_rx: int) -> Event:
-        return event(text, level=level, vehicle=self._vehicle, source=STAGE, boot=self._boot, t=t, t_rx=t_rx)
-
-
-def _rows(steps: Steps, first: int, last: int) -> Steps:
-    rows = slice(first, last)
-    return Steps(
-        steps.t[rows],
-        steps.t_rx[rows],
-        steps.dt[rows],
-        steps.silence[rows],
-        steps.silent[rows],
-        steps.z[rows],
-        steps.r[rows],
-        steps.used[rows],
-        marks=[],
-        late=[],
-    )
-
-
-def _since(message: Message, t_rx: int) -> Message | None:
-    """The samples received at `t_rx` or later; marks are kept whole."""
-    keep = np.ones(len(message.t), np.bool_) if isinstance(message, Mark) else message.t_rx >= t_rx
-    if not keep.any():
-        return None
-    columns = {
-        name: value[keep]
-        for name in message.__struct_fields__
-        if isinstance(value := getattr(message, name), np.ndarray)
-    }
-    return msgspec.structs.replace(message, **columns)

@@ -69,6 +69,14 @@ class Steps(NamedTuple):
     marks: list[tuple[int, int]]
     late: list[tuple[int, int]]
 
+    def cut(self, first: int, last: int) -> Steps:
+        """The steps from `first` to before `last`, without marks and late samples."""
+        rows = slice(first, last)
+        return Steps(
+            self.t[rows], self.t_rx[rows], self.dt[rows], self.silence[rows], self.silent[rows], self.z[rows],
+            self.r[rows], self.used[rows], marks=[], late=[],
+        )  # fmt: skip
+
 
 class Synchroniser:
     """Orders the samples of one vehicle in one boot epoch.
@@ -98,7 +106,7 @@ class Synchroniser:
         self._arrived.append(rows)
 
     def mark(self, t: int, t_rx: int) -> int:
-        """Take a mark in, which is ordered like a sample but is never late; returns its number."""
+        """Take a mark in, which is ordered like a sample but is never late and makes none late; returns its number."""
         self._marks.append(t)
         number = len(self._marks) - 1
         nothing = np.full((1, self._m), np.nan)
@@ -116,31 +124,35 @@ class Synchroniser:
         final : bool
             Nothing more will come: everything leaves.
         """
-        rows = _concatenate([self._empty(), *self._arrived])
+        rows = concatenate([self._empty(), *self._arrived])
         covered = rows.t_rx <= until
-        self._arrived = [] if covered.all() else [_take(rows, ~covered)]
-        rows = _take(rows, covered)
-        rows = _take(rows, np.lexsort((rows.sensor, rows.t, rows.t_rx)))
+        self._arrived = [] if covered.all() else [take(rows, ~covered)]
+        rows = take(rows, covered)
+        rows = take(rows, np.lexsort((rows.sensor, rows.t, rows.t_rx)))
 
-        newest = np.maximum.accumulate(np.concatenate([[self._newest], rows.t]))
+        is_mark = rows.sensor == MARK
+        seen = np.where(is_mark, self._newest, rows.t)  # a mark says nothing about what has been measured
+        newest = np.maximum.accumulate(np.concatenate([[self._newest], seen]))
         passed = newest[:-1] - self._lag
         is_late = rows.t <= passed
-        is_mark = rows.sensor == MARK
         late = [(int(passed[i]) + 1, int(rows.sensor[i])) for i in np.flatnonzero(is_late & ~is_mark)]
         time = np.where(is_late & is_mark, passed + 1, rows.t)
         self._newest = int(newest[-1])
 
         keep = ~is_late | is_mark
-        waiting = _concatenate([self._waiting, _take(rows._replace(t=time), keep)])
+        waiting = concatenate([self._waiting, take(rows._replace(t=time), keep)])
         ready = np.ones(len(waiting.t), np.bool_) if final else waiting.t <= self._newest - self._lag
-        self._waiting = _take(waiting, ~ready)
-        return self._steps(_take(waiting, ready), late)
+        if not final:  # a mark leaves with the next sample, so that the steps of a silence stand on their side of it
+            last = waiting.t[ready & (waiting.sensor != MARK)].max(initial=np.iinfo(np.int64).min)
+            ready &= (waiting.sensor != MARK) | (waiting.t <= last)
+        self._waiting = take(waiting, ~ready)
+        return self._steps(take(waiting, ready), late)
 
     def _steps(self, rows: Rows, late: list[tuple[int, int]]) -> Steps:
         is_mark = rows.sensor == MARK
         marks = sorted((int(t), int(number)) for t, number in zip(rows.t[is_mark], rows.z[is_mark, 0], strict=True))
-        rows = _take(rows, ~is_mark)
-        rows = _take(rows, np.lexsort((rows.t_rx, rows.sensor, rows.t)))
+        rows = take(rows, ~is_mark)
+        rows = take(rows, np.lexsort((rows.t_rx, rows.sensor, rows.t)))
         t, place = np.unique(rows.t, return_inverse=True)
         k = len(t)
         z, r = np.full((k, self._m), np.nan), np.ones((k, self._m))
@@ -182,9 +194,11 @@ class Synchroniser:
         return steps._replace(dt=dt, silence=silence)
 
 
-def _take(rows: Rows, which: NDArray[np.bool_] | NDArray[np.int64]) -> Rows:
+def take(rows: Rows, which: NDArray[np.bool_] | NDArray[np.int64]) -> Rows:
+    """Some of the rows."""
     return Rows(rows.t[which], rows.t_rx[which], rows.sensor[which], rows.z[which], rows.r[which])
 
 
-def _concatenate(parts: list[Rows]) -> Rows:
+def concatenate(parts: list[Rows]) -> Rows:
+    """All rows, one part after the other."""
     return parts[-1] if len(parts) == 1 else Rows(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

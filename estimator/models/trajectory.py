@@ -17,12 +17,16 @@ accuracy sigma, of which it is the share c::
     z = position + sigma sqrt(c) b + v,    var v = (1 - c) sigma^2
     b_{j+1} = exp(-dt/tau) b_j + w,        var w = 1 - exp(-2 dt/tau)
 
-North and east lie in the plane that touches the Earth at the first fix; altitude is above mean sea level. Velocities
-are taken in that plane, which turns away from the local one by the distance over the Earth's radius: 0.1 m/s in 30
-m/s after 20 km.
+North and east lie in the plane that touches the Earth at the first fix, and so do the velocities north and east: they
+are the rates of those two. Receivers state velocities along the north and east of where the vehicle is. At distance d
+these axes have turned against the plane's, by d/R tan(latitude) for a flight to the east and by d/R out of the plane
+(R: the Earth's radius), so every fix is turned into the plane's axes. Altitude is above mean sea level and the climb
+rate is its rate, along the local vertical.
 """
 
 from __future__ import annotations
+
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -54,6 +58,11 @@ _AXES = (0, 2, 4)  # states of position
 _BIAS, _ERROR = 6, 7
 
 
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+Share = Annotated[float, msgspec.Meta(ge=0, lt=1)]
+
+
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How the vehicle is expected to move, and what is known of it before the first measurement.
 
@@ -72,14 +81,14 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         Standard deviations about the first fix, about rest, and about zero; m, m/s, m.
     """
 
-    acceleration_horizontal: float = 10.0
-    acceleration_vertical: float = 5.0
-    altimeter_drift: float = 0.01
-    gnss_correlation_time: float = 100.0
-    gnss_correlated_share: float = 0.8
-    prior_position: float = 1e4
-    prior_velocity: float = 300.0
-    prior_altimeter_bias: float = 500.0
+    acceleration_horizontal: NotNegative = 10.0
+    acceleration_vertical: NotNegative = 5.0
+    altimeter_drift: NotNegative = 0.01
+    gnss_correlation_time: Positive = 100.0
+    gnss_correlated_share: Share = 0.8
+    prior_position: Positive = 1e4
+    prior_velocity: Positive = 300.0
+    prior_altimeter_bias: Positive = 500.0
 
 
 class Trajectory:
@@ -143,7 +152,7 @@ class Trajectory:
         z, r = np.full((k, M), np.nan), np.ones((k, M))
         z[:, 0], z[:, 1] = self.plane.to_plane(latitude, longitude, altitude)
         z[:, 2] = altitude
-        z[:, 3:5] = velocity[:, :2]
+        z[:, 3], z[:, 4] = self.plane.turn(latitude, longitude, velocity)
         z[:, 5] = -velocity[:, 2]
         r[:, 0:2] = (1 - self._share) * sigma[:, :1] ** 2
         r[:, 2] = (1 - self._share) * sigma[:, 1] ** 2

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import itertools
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from estimator.geodesy import ECCENTRICITY2, SEMI_MAJOR
+from estimator.models import trajectory
 from estimator.models.trajectory import NAMES
 from estimator.stage import Settings, estimate
 from telemetry.messages import Altitude, Estimate, Event, Gnss, Mark, Message, Progress, Window
@@ -244,8 +247,6 @@ def test_vehicles_do_not_touch_one_another():
 
 def test_consistent_errors_give_a_consistent_nis():
     """White errors of the stated size, and a model that says they are white."""
-    from estimator.models import trajectory
-
     quiet = trajectory.Settings(gnss_correlated_share=0.0, acceleration_horizontal=0.1, acceleration_vertical=0.1)
     found = live(run(flight(120, seed=5), options=Settings(trajectory=quiet)))
     known = found["t"] > 1005 * S
@@ -254,7 +255,262 @@ def test_consistent_errors_give_a_consistent_nis():
 
 
 def test_settings_refuse_what_they_do_not_know():
-    import msgspec
-
     with pytest.raises(msgspec.ValidationError, match="unknown field `windw`"):
         msgspec.convert({"windw": 3}, Settings)
+
+
+NONSENSE = [
+    *((f, v) for f in ("grid", "gap", "window", "test_point") for v in (0.0, -1.0, np.inf, np.nan)),
+    *(("lag", v) for v in (-0.1, np.inf, np.nan)),
+]
+NONSENSE_OF_THE_MODEL = [
+    *((f"prior_{f}", v) for f in ("position", "velocity", "altimeter_bias") for v in (0.0, -1.0, np.inf)),
+    *((f, v) for f in ("acceleration_horizontal", "acceleration_vertical", "altimeter_drift") for v in (-1.0, np.inf)),
+    *(("gnss_correlated_share", v) for v in (-0.1, 1.0, np.nan)),
+    ("gnss_correlation_time", 0.0),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), NONSENSE)
+def test_settings_refuse_nonsense_by_name(name, value):
+    with pytest.raises(msgspec.ValidationError, match=rf"\$\.{name}"):
+        msgspec.convert({name: value}, Settings)
+
+
+@pytest.mark.parametrize(("name", "value"), NONSENSE_OF_THE_MODEL)
+def test_settings_of_the_model_refuse_nonsense_by_name(name, value):
+    with pytest.raises(msgspec.ValidationError, match=rf"\$\.trajectory\.{name}"):
+        msgspec.convert({"trajectory": {name: value}}, Settings)
+
+
+# -- what must not end, blind or fool the estimate ---------------------------------------------------------------------
+
+
+def moved(messages, by, *, after=-np.inf):
+    """The same messages with their vehicle time `by` seconds later, from `after` on."""
+    return [msgspec.structs.replace(m, t=m.t + round(by * S)) if m.t_rx[0] / S > after else m for m in messages]
+
+
+def later(messages, by):
+    """The same messages, sent and received `by` seconds later."""
+    return [msgspec.structs.replace(m, t=m.t + round(by * S), t_rx=m.t_rx + round(by * S)) for m in messages]
+
+
+def at(messages, latitude, longitude):
+    """The same messages at another place."""
+    return [
+        msgspec.structs.replace(m, latitude=m.latitude + latitude, longitude=m.longitude + longitude)
+        if isinstance(m, Gnss)
+        else m
+        for m in messages
+    ]
+
+
+def altitude(t, value=500.0, t_rx=None, vehicle=1) -> Altitude:
+    return Altitude(
+        vehicle=vehicle,
+        source="0/1",
+        boot=0,
+        t=np.array([round(t * S)]),
+        t_rx=np.array([round((t if t_rx is None else t_rx) * S)]),
+        altitude=np.full(1, value),
+        pressure=np.ones(1),
+        sigma=np.full(1, 0.5),
+    )
+
+
+def said(messages, what):
+    return [e for e in told(messages, Event) if what in e.text[0]]
+
+
+def used(messages):
+    return sum(sum(w.measurements.values()) for w in told(messages, Window))
+
+
+def windows(messages):
+    return [(w.number, w.test_point, w.reason) for w in told(messages, Window)]
+
+
+SHORT = flight(12)
+AWAY = [*SHORT, *at(later(flight(8, seed=2), 12), 0.1, 0.0)]
+TROUBLE = {
+    "wild": [*SHORT, altitude(4610.0, t_rx=1006.01)],
+    "leap": moved(SHORT, 60, after=1006),
+    "step back": [*moved(SHORT, -30, after=1006), mark(1002, "start", "1"), mark(1009.5, "stop", "1")],
+    "failure": [*SHORT, altitude(1006.003, np.inf), altitude(1009.003, np.inf)],
+    "long silence": [*SHORT, *later(flight(8, seed=2), 86_400), mark(1005, "start", "1")],
+    "away": AWAY,
+    "mark in a silence": [*flight(12, silence=[(4, 9)]), mark(1006, "start", "1")],
+    "all": sorted(
+        [
+            *moved(AWAY, -30, after=1015),
+            altitude(1005.003, np.inf),
+            altitude(4610.0, t_rx=1005.35),
+            altitude(4610.1, t_rx=1005.75),
+            mark(1004, "start", "2"),
+        ],
+        key=lambda m: m.t_rx[0],
+    ),
+}
+
+
+@given(
+    st.sampled_from(sorted(TROUBLE)), st.lists(st.integers(1, 190), max_size=30), st.sampled_from(["window", "sortie"])
+)
+@settings(max_examples=40, deadline=None)
+def test_batches_do_not_change_a_bit_of_trouble_either(trouble, cuts, scope):
+    messages = TROUBLE[trouble]
+    cuts = [c for c in cuts if c < len(messages)]
+    whole, parts = run(messages, scope=scope), run(messages, cuts, scope=scope)
+    for a, b in ((live(whole), live(parts)), (smoothed(whole), smoothed(parts))):
+        for name in a:
+            np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+    about = ("number", "test_point", "reason", "measurements", "late", "anchors", "nis", "dof", "digest")
+    assert [[getattr(m, a) for a in about] for m in told(parts, Window)] == [
+        [getattr(m, a) for a in about] for m in told(whole, Window)
+    ]
+    assert sorted((e.text, e.t[0], e.t_rx[0]) for e in told(parts, Event)) == sorted(
+        (e.text, e.t[0], e.t_rx[0]) for e in told(whole, Event)
+    )
+
+
+def test_one_wild_time_is_left_out_and_told():
+    out, without = run(TROUBLE["wild"]), run(SHORT)
+    np.testing.assert_array_equal(live(out)["mean"], live(without)["mean"])
+    assert len(said(out, "a sample of altitude 3604 s ahead of the others was left out")) == 1
+
+
+def test_a_clock_that_leaps_ahead_and_stays_there_is_followed():
+    out = run(TROUBLE["leap"])
+    assert [w.reason for w in told(out, Window)] == ["gap", "end"]
+    assert used(out) == used(run(SHORT))
+
+
+def test_a_clock_that_steps_back_is_followed():
+    out = run(TROUBLE["step back"])
+    assert windows(out) == [(0, "", "mark"), (1, "1", "gap"), (2, "1", "mark"), (3, "", "end")]
+    assert len(said(out, "the vehicle clock stepped back by 29.9 s: the estimate begins anew")) == 1
+    assert used(out) >= used(run(SHORT)) - 2, "nothing but what came before the next fix is lost"
+
+
+def test_a_burst_of_old_samples_is_late_and_nothing_more():
+    burst = [altitude(1002 + 0.1 * i, 9e3, t_rx=1008.0) for i in range(8)]
+    out, without = run([*SHORT, *burst]), run(SHORT)
+    np.testing.assert_array_equal(live(out)["mean"], live(without)["mean"])
+    assert [w.late for w in told(out, Window)] == [{"altitude": 8}]
+
+
+def test_a_failure_begins_anew_and_touches_no_other_vehicle():
+    other = flight(12, vehicle=2, seed=9)
+    out = run([*TROUBLE["failure"], *other])
+    mine = [m for m in out if m.vehicle == 1]
+    (first, second) = told([m for m in out if isinstance(m, Event) and m.level[0] == "error"], Event)
+    assert first.text[0].startswith("the estimate of vehicle 1, boot 0 failed and begins anew: z is infinite")
+    assert first.t[0] == round(1006.003 * S)
+    assert second.t[0] == round(1009.003 * S)
+    assert windows(mine) == [(0, "", "gap"), (1, "", "gap"), (2, "", "end")]
+    assert used(mine) > used(run(SHORT)) - 20
+    theirs = [m for m in out if m.vehicle == 2]
+    np.testing.assert_array_equal(live(theirs)["mean"], live(run(other))["mean"])
+
+
+@pytest.mark.parametrize("days", [0.01, 1, 365, 10_000])
+def test_a_silence_too_long_to_be_bridged_begins_anew(days):
+    out = run([*SHORT, *later(flight(8, seed=2), days * 86_400)])
+    assert [w.reason for w in told(out, Window)] == ["gap", "end"]
+    assert len(said(out, "s without a measurement: the estimate begins anew")) == 1
+    assert (live(out)["dof"] > 0).all()
+
+
+def test_windows_are_not_cut_by_their_length_inside_a_silence():
+    out = run(flight(130, silence=[(10, 110)]), options=Settings(window=15))
+    assert [w.reason for w in told(out, Window)] == ["gap", "length", "end"]
+    assert all(sum(w.measurements.values()) > 20 for w in told(out, Window))
+
+
+@pytest.mark.parametrize("cuts", [None, range(1, 170)])
+@pytest.mark.parametrize("options", [Settings(), Settings(window=8)])
+def test_what_a_silence_did_is_told_the_same_however_it_is_cut(cuts, options):
+    for length in (3.0, 3.5, 4.0, 4.5, 5.0):
+        messages = flight(17, silence=[(5, 5 + length)])
+        (event,) = said(run(messages, cuts, options=options), "without a measurement")
+        found = live(run(messages))
+        before = found["std"][found["t"] < 1005 * S][-1, 0]
+        assert f"std(north) {before:.1f} ->" in event.text[0]
+
+
+def test_before_the_first_fix_nothing_is_kept_but_marks():
+    early = [altitude(900 + 0.1 * i) for i in range(500)]
+    out = run([*early, mark(940, "start", "1"), *SHORT], range(1, 500))
+    assert {w.test_point for w in told(out, Window) if w.dof} == {"1"}
+    np.testing.assert_array_equal(live(out)["mean"], live(run(SHORT))["mean"])
+
+
+def test_the_time_of_having_had_no_fix_is_the_newest():
+    out = run([altitude(1010.0, t_rx=1010.0), altitude(1005.0, t_rx=1011.0)])
+    assert said(out, "no satellite fix")[0].t[0] == 1010 * S
+
+
+def test_late_samples_of_an_empty_window_are_not_lost():
+    fixes = [m for m in FLIGHT if isinstance(m, Gnss)]
+    early = [m for m in fixes if m.t[0] < 1009 * S]
+    rest = [m for m in fixes if m.t[0] > 1012 * S]
+    late = [msgspec.structs.replace(fixes[5], t=fixes[5].t + 7, t_rx=np.array([1010 * S + i])) for i in (0, 2)]
+    out = run(
+        [*early, mark(1009.2, "start", "A"), late[0], mark(1009.4, "stop", "A"), late[1], *rest],
+        options=Settings(gap=9),
+    )
+    assert sum(w.late.get("gnss", 0) for w in told(out, Window)) == 2
+
+
+def test_far_from_the_origin_another_one_is_taken():
+    out = run(AWAY)
+    assert len(said(out, "origin")) == 4
+    assert [w.reason for w in told(out, Window)] == ["gap", "end"]
+    found = smoothed(out)
+    assert abs(found["geodetic"][-1, 0] - (0.9 + 20 * 8 / RADIUS)) * RADIUS < 10
+
+
+def test_one_fix_far_away_is_left_out():
+    (fix,) = at(
+        [SHORT[30] if isinstance(SHORT[30], Gnss) else next(m for m in SHORT[30:] if isinstance(m, Gnss))], 1, 1
+    )
+    out = run([msgspec.structs.replace(fix, t=fix.t + 1, t_rx=fix.t_rx + 1), *SHORT])
+    np.testing.assert_array_equal(live(out)["mean"], live(run(SHORT))["mean"])
+    assert len(said(out, "km from the origin was left out")) == 1
+
+
+def test_a_fix_at_zero_is_none():
+    nowhere = [
+        msgspec.structs.replace(m, latitude=np.zeros(1), longitude=np.zeros(1)) if isinstance(m, Gnss) else m
+        for m in flight(5, begin=990)
+    ]
+    out = run([*nowhere, *SHORT])
+    assert len(said(out, "fixes at latitude 0, longitude 0 are none")) == 1
+    np.testing.assert_array_equal(live(out)["mean"], live(run(SHORT))["mean"])
+
+
+def test_far_to_the_east_the_errors_stay_consistent():
+    """300 km along the parallel of 60 degrees, where north turns by 4 degrees."""
+    n, speed, random = 1500, 200.0, np.random.default_rng(1)
+    latitude, k = np.deg2rad(60.0), np.arange(n)
+    normal = SEMI_MAJOR / np.sqrt(1 - ECCENTRICITY2 * np.sin(latitude) ** 2) + 500
+    t = (1000 + k) * S
+    fixes = Gnss(
+        vehicle=1,
+        source="0/1",
+        boot=0,
+        t=t,
+        t_rx=t,
+        latitude=latitude + random.normal(size=n) * 1.5 / RADIUS,
+        longitude=speed * k / normal / np.cos(latitude) + random.normal(size=n) * 1.5 / RADIUS / np.cos(latitude),
+        altitude=500 + 2 * random.normal(size=n),
+        velocity=np.column_stack(
+            [0.3 * random.normal(size=n), speed + 0.3 * random.normal(size=n), np.full(n, np.nan)]
+        ),
+        sigma=np.tile([1.5, 2, 0.3], (n, 1)),
+        satellites=np.full(n, 9),
+    )
+    found = live(run([fixes]))
+    first, last = (found["nis"][s].sum() / found["dof"][s].sum() for s in (slice(50, 400), slice(n - 400, n)))
+    assert last == pytest.approx(first, rel=0.25)

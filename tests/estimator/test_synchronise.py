@@ -86,6 +86,25 @@ def test_a_mark_is_ordered_like_a_sample_but_is_never_late():
     assert times(steps) == [1000, 1200]
 
 
+def test_a_mark_makes_no_sample_late():
+    s = synchroniser(lag=100)
+    s.push(rows([(1000, 1, 0, 1.0), (1050, 3, 0, 1.0)]))
+    s.mark(5000 * MS, 2 * MS)
+    steps = s.release(9 * MS, final=True)
+    assert times(steps) == [1000, 1050]
+    assert not steps.late
+
+
+def test_a_mark_in_a_silence_leaves_with_the_sample_that_ends_it():
+    s = synchroniser(lag=100, grid=500)
+    s.push(rows([(0, 1, 0, 1.0), (2000, 3, 0, 1.0)]))
+    s.mark(700 * MS, 2 * MS)
+    assert not s.release(3 * MS).marks
+    s.push(rows([(2200, 4, 0, 1.0)]))
+    steps = s.release(4 * MS)
+    assert (times(steps), steps.marks) == ([500, 1000, 1500, 2000], [(700 * MS, 0)])
+
+
 def test_a_silence_is_filled_so_that_it_is_seen():
     s = synchroniser(grid=500)
     s.push(rows([(0, 1, 0, 1.0), (400, 2, 0, 1.0), (2100, 3, 0, 1.0)]))

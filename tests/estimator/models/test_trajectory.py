@@ -60,6 +60,16 @@ def test_down_becomes_up():
     assert z[0, 5] == -3
 
 
+def test_velocities_are_in_the_axes_of_the_plane():
+    """To the north and five degrees to the east at 60 degrees, north has turned by 5 sin(60) degrees."""
+    model = Trajectory(np.deg2rad(60), 0.0, 0.0, Settings())
+    place = np.deg2rad([60.0]), np.deg2rad([5.0]), np.zeros(1)
+    z, _ = model.gnss(*place, np.array([[100.0, 0.0, np.nan]]), np.ones((1, 3)))
+    angle = np.deg2rad(5) * np.sin(np.deg2rad(60))
+    np.testing.assert_allclose(z[0, 3:5], [100 * np.cos(angle), -100 * np.sin(angle)], atol=0.2)
+    assert np.isnan(z[0, 5])
+
+
 def test_the_altimeter_measures_altitude_and_its_own_offset():
     z, r = MODEL.altimeter(np.array([480.0]), np.array([0.7]))
     assert np.isnan(z[0, :6]).all()

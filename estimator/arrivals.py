@@ -1,0 +1,231 @@
+"""Arrivals: which samples to believe, and where a leg of the estimate begins and ends.
+
+A leg is a stretch of one boot epoch with one clock and one origin: it begins with a satellite fix and lasts until the
+clock steps, a silence is too long to be bridged, or the vehicle is too far away for a plane.
+
+A vehicle's clock may leap. Such a time counts only when the arrivals that follow confirm it: one for a time ahead, more
+for one behind, because a burst of old samples is nothing special. Until then nothing behind it is judged. What nobody
+confirms is left out (ahead) or goes on as an ordinary late sample (behind).
+
+Everything is decided by the order of arrival alone, so it does not depend on how the stream was cut into batches.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.geodesy import to_earth
+from estimator.synchronise import MARK, Rows, concatenate, take
+
+S = 1_000_000_000
+LEAP = 10 * S  # further ahead of the newest time than this is to be confirmed; so far apart the confirming ones may be
+LATE = 1 * S  # further behind the oldest time that is still waited for than this is perhaps a step of the clock
+AHEAD, BEHIND = 2, 10  # arrivals that make a leap and a step back
+SILENCE = 600 * S  # a longer one is not bridged
+FAR = 300e3  # m from the origin
+
+Place = tuple[float, float, float]  # latitude, longitude (rad), altitude (m)
+
+
+class Note(NamedTuple):
+    """What should be told, the times it is told for, and the row it is about."""
+
+    text: str
+    t: int
+    t_rx: int
+    row: int
+
+
+class Piece(NamedTuple):
+    """A stretch of arrivals.
+
+    Attributes
+    ----------
+    origin : Place or None
+        A new leg begins with this piece, at this place; None: it belongs to the leg before.
+    rows : Rows
+        What is to be believed, beginning with marks that waited for a leg.
+    over : bool
+        The leg ends with it.
+    rest : Rows
+        What remains to be judged.
+    notes : list of Note
+    judged : Rows
+    places : int array
+        Where in `judged` each of `rows` was; -1 for a mark that waited.
+    """
+
+    origin: Place | None
+    rows: Rows
+    over: bool
+    rest: Rows
+    notes: list[Note]
+    judged: Rows
+    places: NDArray[np.int64]
+
+    def row(self, t: int) -> int:
+        """The row judged by whose arrival the time `t` was reached."""
+        seen = np.maximum.accumulate(np.where(self.rows.sensor == MARK, np.iinfo(np.int64).min, self.rows.t))
+        reached = self.places[np.searchsorted(seen, t) :]
+        return int(reached[0]) if len(reached) else len(self.judged.t)
+
+
+class Arrivals:
+    """The samples of one vehicle in one boot epoch, as they arrive.
+
+    Rows hold the values as the sensors state them. Those of the sensor `fix` begin with latitude, longitude (rad) and
+    altitude (m).
+
+    Parameters
+    ----------
+    sensors : tuple of str
+        Their names.
+    fix : int
+        Number of the sensor that gives places.
+    lag : int
+        How long a sample waits for older ones, ns.
+    """
+
+    def __init__(self, sensors: tuple[str, ...], fix: int, *, lag: int) -> None:
+        self._sensors, self._fix, self._late = sensors, fix, lag + LATE
+        self._waiting: list[Rows] = []
+        self._early: list[Rows] = []  # marks before the first fix of a leg
+        self._origin: tuple[float, ...] | None = None  # Earth-fixed
+        self._newest = 0
+        self._far = False  # the fix before was too far away
+        self._nowhere = False  # fixes at (0, 0) have been told in this leg
+
+    def push(self, rows: Rows) -> None:
+        """Take arrivals in; nothing is judged before its receive time has been covered."""
+        self._waiting.append(rows)
+
+    def covered(self, until: int) -> Rows | None:
+        """What has arrived up to `until` and is to be judged now, in order."""
+        if not self._waiting:
+            return None
+        rows = concatenate(self._waiting)
+        now = rows.t_rx <= until
+        self._waiting = [] if now.all() else [take(rows, ~now)]
+        rows = take(rows, now)
+        return take(rows, np.lexsort((rows.sensor, rows.t, rows.t_rx)))
+
+    def forget(self) -> None:
+        """End the leg: the next fix begins another."""
+        self._origin, self._nowhere = None, False
+
+    def judge(self, rows: Rows, final: bool) -> Piece:
+        """Judge arrivals up to the end of a leg; with `final`, nothing will come that could confirm anything."""
+        notes: list[Note] = []
+        place, first = None, 0
+        if self._origin is None:
+            found = self._found(rows, notes)
+            marks = np.flatnonzero(rows.sensor[:found] == MARK)
+            self._early += [take(rows, marks)] if len(marks) else []
+            if found == len(rows.t):
+                nothing = take(rows, marks[:0])
+                return Piece(None, nothing, False, nothing, notes, rows, marks[:0])
+            latitude, longitude, altitude = (float(x) for x in rows.z[found, :3])
+            place, first = (latitude, longitude, altitude), found
+            self._origin = tuple(to_earth(rows.z[found, 0], rows.z[found, 1], rows.z[found, 2]).tolist())
+            self._newest, self._far = int(rows.t[found]), False
+        kept, end, over = self._walk(rows, first, final, notes)
+        if over:
+            self.forget()
+        elif end < len(rows.t):  # undecided
+            self._waiting.insert(0, take(rows, np.arange(end, len(rows.t))))
+            rows = take(rows, np.arange(end))
+        index = np.array(list(kept), np.int64)
+        believed = take(rows, index)._replace(t=np.array(list(kept.values()), np.int64))
+        if place is not None and self._early:
+            early, self._early = concatenate(self._early), []
+            believed, index = concatenate([early, believed]), np.concatenate([np.full(len(early.t), -1), index])
+        judged, rest = take(rows, np.arange(end)), take(rows, np.arange(end, len(rows.t)))
+        return Piece(place, believed, over, rest, notes, judged, index)
+
+    def _found(self, rows: Rows, notes: list[Note]) -> int:
+        """Index of the first fix, or the number of rows."""
+        for i in np.flatnonzero(rows.sensor == self._fix).tolist():
+            if np.isfinite(rows.z[i, :3]).all() and not self._is_nowhere(rows, i, notes):
+                return int(i)
+        return len(rows.t)
+
+    def _is_nowhere(self, rows: Rows, i: int, notes: list[Note]) -> bool:
+        nowhere = rows.z[i, 0] == 0 and rows.z[i, 1] == 0
+        if nowhere and not self._nowhere:
+            self._nowhere = True
+            notes.append(_note(rows, i, "fixes at latitude 0, longitude 0 are none: left out"))
+        return bool(nowhere)
+
+    def _walk(self, rows: Rows, first: int, final: bool, notes: list[Note]) -> tuple[dict[int, int], int, bool]:
+        """Times of the rows to be believed by their index, the index of the first row not judged, and whether the leg
+        ends there.
+        """
+        times, sensors = rows.t.tolist(), rows.sensor.tolist()
+        fixed = (rows.sensor == self._fix) & np.isfinite(rows.z[:, :3]).all(axis=1)
+        earth = np.zeros((len(times), 3))
+        earth[fixed] = to_earth(rows.z[fixed, 0], rows.z[fixed, 1], rows.z[fixed, 2])
+        kept: dict[int, int] = {}
+        for i in range(first, len(times)):
+            t, sensor = times[i], sensors[i]
+            ahead = t > self._newest + LEAP
+            if sensor == MARK:
+                kept[i] = self._newest if ahead else t
+                continue
+            if ahead or t < self._newest - self._late:
+                confirmed = self._confirmed(times, sensors, i)
+                if confirmed is None and not final:
+                    return kept, i, False
+                by = abs(t - self._newest) / S
+                if confirmed and not ahead:
+                    text = f"the vehicle clock stepped back by {by:.1f} s: the estimate begins anew"
+                    notes.append(_note(rows, i, text))
+                    return kept, i, True
+                if confirmed and t > self._newest + SILENCE:
+                    notes.append(_note(rows, i, f"{by:.0f} s without a measurement: the estimate begins anew"))
+                    return kept, i, True
+                if ahead and not confirmed:
+                    name = self._sensors[sensor]
+                    text = f"a sample of {name} {by:.0f} s ahead of the others was left out"
+                    notes.append(_note(rows, i, text)._replace(t=self._newest))
+                    continue
+            if fixed[i]:
+                assert self._origin is not None
+                distance = math.dist(earth[i].tolist(), self._origin)
+                if self._is_nowhere(rows, i, notes):
+                    continue
+                if distance > FAR:
+                    away = f"a fix {distance / 1e3:.0f} km from the origin"
+                    if self._far:
+                        notes.append(_note(rows, i, f"{away} again: the estimate begins anew there"))
+                        return kept, i, True
+                    self._far = True
+                    notes.append(_note(rows, i, f"{away} was left out"))
+                    continue
+                self._far = False
+            kept[i] = t
+            self._newest = max(self._newest, t)
+        return kept, len(times), False
+
+    def _confirmed(self, times: list[int], sensors: list[int], i: int) -> bool | None:
+        """Whether the arrivals after i confirm its time; None when that cannot be said yet."""
+        ahead = times[i] > self._newest
+        missing, last = (AHEAD if ahead else BEHIND) - 1, times[i]
+        for j in range(i + 1, len(times)):
+            if sensors[j] == MARK:
+                continue
+            t = times[j]
+            elsewhere = t > self._newest + LEAP if ahead else t < self._newest - self._late
+            if not elsewhere or abs(t - last) > LEAP:
+                return False
+            missing, last = missing - 1, t
+            if missing == 0:
+                return True
+        return None
+
+
+def _note(rows: Rows, i: int, text: str) -> Note:
+    return Note(text, int(rows.t[i]), int(rows.t_rx[i]), i)
