@@ -85,7 +85,7 @@ def estimate(
     """
     settings = settings or Settings()
     vehicles: dict[int, dict[int, _Epoch]] = {}
-    for message in messages:
+    for message in _ended(messages):
         if isinstance(message, Gnss | Altitude | Mark):
             epochs = vehicles.setdefault(message.vehicle, {})
             if message.boot not in epochs:
@@ -101,6 +101,17 @@ def estimate(
                     else:
                         yield from epochs[boot].advance(until)
             yield Progress(vehicle=0, source=STAGE, boot=0, t=message.t, t_rx=message.t_rx, final=message.final)
+
+
+def _ended(messages: Iterable[Message]) -> Iterator[Message]:
+    """The messages, with a final word where they break off without one: what has been covered is then the end."""
+    last: Progress | None = None
+    for message in messages:
+        if isinstance(message, Progress):
+            last = message
+        yield message
+    if last is not None and not last.final:
+        yield msgspec.structs.replace(last, final=True)
 
 
 def warm_up() -> None:

@@ -238,6 +238,13 @@ def test_late_samples_are_counted_where_they_were_missed():
     np.testing.assert_array_equal(live(out)["mean"], live(without)["mean"])
 
 
+def test_input_that_breaks_off_closes_the_window():
+    stream = [*FLIGHT, progress(FLIGHT)]
+    out = list(estimate(stream))
+    assert [w.reason for w in told(out, Window)][-1] == "end"
+    assert told(out, Progress)[-1].final
+
+
 def test_vehicles_do_not_touch_one_another():
     both = run([*FLIGHT, *flight(vehicle=2, seed=9, silence=[(3, 8)])])
     alone = run(FLIGHT)
