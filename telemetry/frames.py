@@ -7,7 +7,8 @@ A MAVLink frame (v2 above, v1 below; the checksum covers everything after STX an
 
 A telemetry log (tlog) is a sequence of records, 8 bytes of big-endian microseconds (receive time, Unix) and then the
 frame.
-What arrived but was no frame is evidence too: our archive keeps it as a record of its own, which other readers skip::
+What arrived but was no frame is evidence too: our archive keeps it as a record of its own. Other readers take it for
+noise and skip it; one that trusts the length byte of a broken frame may skip good ones behind it too::
 
     time[8] frame[...]
     time[8] 00 'j' 'u' 'n' 'k' length[2, little-endian] bytes[length]
