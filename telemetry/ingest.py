@@ -2,8 +2,9 @@
 
 Every frame gets its place on its vehicle's clock, every sequence number its fate, and what a frame measures becomes
 samples in SI units. Frames that cannot be placed yet (a vehicle whose clock has stepped back may have rebooted; the
-next frames tell) wait for the next batch, and `Progress` says how far everything has been told. Nothing depends on
-how the stream was cut into batches.
+next frames tell) wait for the next batch, and `Progress` says how far everything has been told. What is said
+does not depend on how the stream was cut into batches; only how often the byte account is told does, and which of two
+events about different things comes first.
 """
 
 from __future__ import annotations
