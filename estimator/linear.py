@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import importlib
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from estimator import rivals
-from estimator.information import RULE, filter, start
+from estimator.information import Filtered, filter, start
 from estimator.model import LinearModel
-from estimator.smoother import backward
-from estimator.snapshots import Store
+from estimator.smoother import Interval, backward, stretches
+from estimator.snapshots import SPILL, Store
 from estimator.ud import Array
 from estimator.window import Rule
+
+RESULTS = ("mean", "std", "covariance", "cross", "filtered")
+TOGETHER = 8  # records on a thread of their own, at least: each thread repeats the recursion of the covariance
+WANT = ("mean", "std", "covariance", "filtered")
 
 
 class Smoothed(NamedTuple):
     """A record, smoothed: epoch 0 is the prior's, epoch j + 1 the one where step j ends.
+
+    What was not asked for was not computed and is empty: its first axis has length 0. Of K records of one model every
+    array has an axis K in front; where records share their factors, the rows of a covariance are one array seen K times
+    (read-only).
 
     Attributes
     ----------
@@ -30,6 +41,8 @@ class Smoothed(NamedTuple):
         First steps of the windows.
     bytes_per_step : int
         Kept from the forward pass for the backward pass.
+    cross : (N, n, n) array
+        Covariance of neighbours: row j is cov(x_j, x_{j+1}), rows of the earlier epoch, columns of the later.
     """
 
     mean: Array
@@ -39,6 +52,7 @@ class Smoothed(NamedTuple):
     filtered_std: Array
     windows: list[int]
     bytes_per_step: int
+    cross: Array
 
 
 def smooth(
@@ -49,46 +63,224 @@ def smooth(
     p0: ArrayLike | None = None,
     method: str = "ms",
     window: int | None = None,
+    want: Iterable[str] = WANT,
+    threads: int = 1,
+    spill: Path | str | None = None,
 ) -> Smoothed:
-    """Fixed-interval smoothing of a whole record.
+    """Fixed-interval smoothing of a whole record, or of many records of one model.
 
     Parameters
     ----------
     model : LinearModel
-    z : (N, m) array
-        NaN = missing.
-    x0, p0 : (n,) mean and (n, n) covariance or (n,) variances, optional
+    z : (N, m) array, or (K, N, m) for K records
+        NaN = missing. Records that miss the same measurements share the recursion of the covariance.
+    x0, p0 : (n,) or (K, n) mean and (n, n) covariance or (n,) variances, optional
         Prior at epoch 0; both None: no prior information.
     method : str
         "ms", or a method of ``estimator.rivals``.
     window : int, optional
         Steps per window, None = 100; a condition number above 1e4 closes one earlier, so that whole-record windows stay
         exact on unstable systems too. Methods without windows take no notice.
+    want : names among "mean", "std", "covariance", "cross", "filtered"
+        What is computed and returned; the mean always is.
+    threads : int
+        2 filters a record from both ends to the middle and smooths it outwards, one thread each way: "ms" only, and the
+        filter's estimates end in the middle (``middle``). Of many records, threads share the work.
+    spill : path, optional
+        A folder for records whose steps or results do not fit in memory: snapshots go there, and the results are files
+        mapped into memory ("ms" only, one record).
 
     Raises
     ------
     ValueError
-        Unknown method, or data that the method cannot use; names argument and step. ``Unobservable`` is one of them.
+        Unknown method or result, or data that the method cannot use; names argument and step. ``Unobservable`` is one
+        of them.
     """
-    if method == "ms":
-        return _ms(model, z, x0, p0, window)
-    if method not in rivals.METHODS:
+    wanted = frozenset([want] if isinstance(want, str) else want)
+    if not wanted <= frozenset(RESULTS):
+        raise ValueError(f"want names {sorted(wanted - frozenset(RESULTS))[0]!r}: choose from {', '.join(RESULTS)}")
+    if method != "ms" and method not in rivals.METHODS:
         raise ValueError(f"method {method!r} is unknown: choose from ms, {', '.join(rivals.METHODS)}")
-    solution: Smoothed = importlib.import_module(rivals.METHODS[method]).smooth(model, z, x0, p0, window)
-    return solution
+    if method != "ms" and spill is not None:
+        raise ValueError(f"method {method!r} keeps everything in memory; spill is for method 'ms'")
+    if threads < 1:
+        raise ValueError(f"threads is {threads}: at least 1 is needed")
+    rule = Rule.of(model) if window is None else Rule.of(model, window)
+
+    def one(z: ArrayLike, x0: ArrayLike | None, wanted: frozenset[str]) -> Smoothed:
+        if method == "ms":
+            return _ms(model, z, x0, p0, rule, wanted)
+        solution: Smoothed = importlib.import_module(rivals.METHODS[method]).smooth(model, z, x0, p0, window, wanted)
+        return solution
+
+    if np.ndim(z) == 3:
+        if spill is not None:
+            raise ValueError("spill is for one record, z of shape (N, m)")
+        return _many(one, np.asarray(z, model.dtype), x0, wanted, threads, shared=method == "ms")
+    if spill is not None:
+        return _spilled(model, model.measurements(z), x0, p0, rule, wanted, Path(spill))
+    if threads > 1 and method == "ms":
+        meet = importlib.import_module("estimator.middle")
+        both: Smoothed = meet.smooth_from_both_ends(model, z, x0, p0, window, wanted)
+        return both
+    return one(z, x0, wanted)
 
 
-def _ms(model: LinearModel, z: ArrayLike, x0: ArrayLike | None, p0: ArrayLike | None, window: int | None) -> Smoothed:
-    rule = RULE if window is None else Rule(steps=window)
+def _ms(
+    model: LinearModel, z: ArrayLike, x0: ArrayLike | None, p0: ArrayLike | None, rule: Rule, wanted: frozenset[str]
+) -> Smoothed:
+    """One record, or (K, N, m) records that miss the same measurements; their factors are returned once."""
+    records = np.shape(z)[0] if np.ndim(z) == 3 else 1
     store = Store()
-    carry, filtered = filter(model, start(model.n, x0, p0), z, rule=rule, store=store)
-    mean, covariance = backward(store, carry)
-    filtered_mean, filtered_std = np.full_like(mean, np.nan), np.full_like(mean, np.inf)
+    carry = start(model.n, x0, p0, records=records, dtype=model.dtype)
+    carry, filtered = filter(model, carry, z, rule=rule, store=store, estimates="filtered" in wanted)
+    smoothed = backward(store, carry, **_flags(wanted))
+    if np.ndim(z) == 3 and records == 1:
+        smoothed = smoothed._replace(mean=smoothed.mean[None])
+    mean, std = _from_epoch_0(model, x0, p0, filtered)
+    windows = [i for i in store.anchors if i < len(store)]
+    return Smoothed(
+        smoothed.mean, smoothed.covariance, smoothed.std, mean, std, windows, store.bytes_per_step, smoothed.cross
+    )
+
+
+def _flags(wanted: frozenset[str]) -> dict[str, bool]:
+    return {name: name in wanted for name in ("std", "covariance", "cross")}
+
+
+def _from_epoch_0(
+    model: LinearModel, x0: ArrayLike | None, p0: ArrayLike | None, filtered: Filtered
+) -> tuple[Array, Array]:
+    """The filter's estimates with the prior in front."""
+    shape = (*filtered.mean.shape[:-2], 0 if filtered.mean.shape[-2] == 0 else filtered.mean.shape[-2] + 1, model.n)
+    mean, std = np.full(shape, np.nan, model.dtype), np.full(shape[-2:], np.inf, model.dtype)
+    if shape[-2] == 0:
+        return mean, std
+    mean[..., 1:, :], std[1:] = filtered.mean, filtered.std
     if x0 is not None and p0 is not None:
         variance = np.asarray(p0, float)
-        filtered_mean[0] = x0
-        filtered_std[0] = np.sqrt(variance if variance.ndim == 1 else np.diag(variance))
-    filtered_mean[1:], filtered_std[1:] = filtered.mean, filtered.std
-    std = np.sqrt(np.einsum("jii->ji", covariance))
+        mean[..., 0, :] = x0
+        std[0] = np.sqrt(variance if variance.ndim == 1 else np.diag(variance))
+        mean[..., 0, np.isinf(std[0])] = np.nan
+    return mean, std
+
+
+def _many(
+    one: Callable[[Array, ArrayLike | None, frozenset[str]], Smoothed],
+    z: Array,
+    x0: ArrayLike | None,
+    wanted: frozenset[str],
+    threads: int,
+    *,
+    shared: bool,
+) -> Smoothed:
+    """K records of one model: those that miss the same measurements together, each group on as many threads."""
+    count = z.shape[0]
+    if count == 0:
+        raise ValueError("z has no records: (K, N, m) with K of at least 1 is needed")
+    if shared:
+        patterns = np.packbits(np.isnan(z).reshape(count, -1), axis=1)
+        group = np.unique(patterns, axis=0, return_inverse=True)[1].reshape(-1)
+    else:
+        group = np.arange(count)
+    members = [np.flatnonzero(group == i) for i in range(group.max() + 1)]
+    jobs = [
+        (part, wanted if not i else wanted & {"filtered"})
+        for own in members
+        for i, part in enumerate(np.array_split(own, min(threads, max(own.size // TOGETHER, 1))))
+    ]
+    first = None if x0 is None else np.broadcast_to(np.asarray(x0, float), (count, np.shape(x0)[-1]))
+
+    def run(job: tuple[NDArray[np.int64], frozenset[str]]) -> Smoothed:
+        part, asked = job
+        prior = None if first is None else first[part]
+        if shared:
+            return one(z[part], prior, asked)
+        alone = one(z[part[0]], None if prior is None else prior[0], asked)
+        return alone._replace(mean=alone.mean[None], filtered_mean=alone.filtered_mean[None])
+
+    if threads == 1:
+        solved = [run(job) for job in jobs]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            solved = list(pool.map(run, jobs))
+    leaders = [solved[next(i for i, (part, _) in enumerate(jobs) if part[0] == own[0])] for own in members]
+
+    def spread(name: str) -> Array:
+        """What groups share, for every record: one array seen K times, or as many copies as there are groups."""
+        parts = [getattr(leader, name) for leader in leaders]
+        if len(parts) == 1:
+            return np.broadcast_to(parts[0], (count, *parts[0].shape))
+        return np.stack(parts)[group]
+
+    mean, filtered = (
+        np.empty((count, *getattr(solved[0], name).shape[1:]), z.dtype) for name in ("mean", "filtered_mean")
+    )
+    for (part, _), own in zip(jobs, solved, strict=True):
+        mean[part], filtered[part] = own.mean, own.filtered_mean
+    lead = leaders[0]
+    return Smoothed(
+        mean, spread("covariance"), spread("std"), filtered, spread("filtered_std"), lead.windows,
+        lead.bytes_per_step, spread("cross"),
+    )  # fmt: skip
+
+
+def _spilled(
+    model: LinearModel, z: Array, x0: ArrayLike | None, p0: ArrayLike | None, rule: Rule, wanted: frozenset[str],
+    folder: Path,
+) -> Smoothed:  # fmt: skip
+    """A record whose snapshots and results are files in ``folder``; the results are mapped into memory."""
+    store, n, count = Store(folder), model.n, z.shape[0]
+    shapes = {
+        "mean": (n,),
+        "std": (n,),
+        "covariance": (n, n),
+        "cross": (n, n),
+        "filtered_mean": (n,),
+        "filtered_std": (n,),
+    }
+    asked = wanted | {"mean"} | ({"filtered_mean", "filtered_std"} if "filtered" in wanted else set())
+    lengths = {name: 0 if name not in asked else count if name == "cross" else count + 1 for name in shapes}
+    files = {name: _created(folder / f"{name}.npy", (lengths[name], *shapes[name]), model.dtype) for name in shapes}
+
+    def write(name: str, row: int, part: Array) -> None:
+        file, offset = files[name]
+        file.seek(offset + row * model.dtype.itemsize * int(np.prod(shapes[name])))
+        np.ascontiguousarray(part).tofile(file)
+
+    carry = start(n, x0, p0, dtype=model.dtype)
+    for a in range(0, count, SPILL):
+        b = min(a + SPILL, count)
+        carry, filtered = filter(model.cut(a, b), carry, z[a:b], rule=rule, store=store, estimates="filtered" in wanted)
+        if "filtered" in wanted:
+            mean, std = _from_epoch_0(model, x0, p0, filtered)
+            skip = 1 if a else 0
+            write("filtered_mean", a + skip, mean[skip:])
+            write("filtered_std", a + skip, std[skip:])
+
+    def room(a: int, b: int) -> Interval:
+        rows = {name: b - a + (name != "cross") if lengths[name] else 0 for name in shapes}
+        mean = np.empty((rows["mean"], n, 1), model.dtype)
+        return Interval(mean, *(np.empty((rows[name], *shapes[name]), model.dtype) for name in Interval._fields[1:]))
+
+    for a, part in stretches(store, carry, 0, room=room, **_flags(wanted)):
+        for name, array in zip(Interval._fields, part, strict=True):
+            skip = 1 if a and name != "cross" else 0
+            if lengths[name]:
+                write(name, a + skip, array[skip:])
+    arrays = {}
+    for name, (file, _) in files.items():
+        file.close()
+        path = folder / f"{name}.npy"
+        arrays[name] = np.load(path, mmap_mode="r") if lengths[name] else np.load(path)
     windows = [i for i in store.anchors if i < len(store)]
-    return Smoothed(mean, covariance, std, filtered_mean, filtered_std, windows, store.bytes_per_step)
+    return Smoothed(windows=windows, bytes_per_step=store.bytes_per_step, **arrays)
+
+
+def _created(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[BinaryIO, int]:
+    """An empty .npy file of this shape, and where its numbers begin."""
+    file = path.open("w+b")
+    np.lib.format.write_array_header_1_0(file, {"descr": dtype.str, "fortran_order": False, "shape": shape})
+    offset = file.tell()
+    file.truncate(offset + int(np.prod(shape)) * dtype.itemsize)
+    return file, offset

@@ -9,7 +9,7 @@ The system, for j = 0..N-1:
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from estimator import noise
 from estimator.ud import Array, compiled
@@ -28,10 +28,10 @@ def _first_bad(array: Array, floor: int) -> int:
     return -1
 
 
-def _contiguous(value: ArrayLike, name: str) -> Array:
-    """C-contiguous float64; a read-only array is copied, because compiled code counts it as another type."""
+def _contiguous(value: ArrayLike, name: str, dtype: DTypeLike) -> Array:
+    """C-contiguous; a read-only array is copied, because compiled code counts it as another type."""
     try:
-        array = np.asarray(value, np.float64, order="C")
+        array = np.asarray(value, dtype, order="C")
     except (TypeError, ValueError):
         raise ValueError(f"{name} is not an array of numbers") from None
     return array if array.flags.writeable else array.copy()
@@ -52,12 +52,16 @@ class LinearModel:
         Measurement.
     r : (m,) or (N, m) variances, or (m, m), (1, m, m) or (N, m, m) covariances
         Measurement noise, positive.
+    dtype : float64 or float32
+        Of everything that is computed. In float32 standard deviations are right to about five digits; a mean only when
+        the states are deviations, not large numbers that near-perfect measurements tell apart.
 
     Attributes
     ----------
     n, p, m : int
     steps : int or None
         N, or None when nothing varies.
+    dtype : numpy dtype
     phi, gamma, q, h, r : arrays
         With a leading axis of 1 or N. Correlated process noise is absorbed: gamma <- gamma U_Q, q (.., p) its pivots.
 
@@ -74,12 +78,25 @@ class LinearModel:
     it is refused. With a leading axis, (1, p, p) or (N, p, p), there is nothing to interpret.
     """
 
-    __slots__ = ("gamma", "h", "m", "n", "p", "phi", "q", "r", "steps")
+    __slots__ = ("dtype", "gamma", "h", "m", "n", "p", "phi", "q", "r", "steps", "tables")
 
-    def __init__(self, phi: ArrayLike, gamma: ArrayLike, q: ArrayLike, h: ArrayLike, r: ArrayLike) -> None:
-        self.phi = _stacked(phi, "phi", "n, n")
-        self.gamma = _stacked(gamma, "gamma", "n, p")
-        self.h = _stacked(h, "h", "m, n")
+    def __init__(
+        self,
+        phi: ArrayLike,
+        gamma: ArrayLike,
+        q: ArrayLike,
+        h: ArrayLike,
+        r: ArrayLike,
+        *,
+        dtype: DTypeLike = np.float64,
+    ) -> None:
+        self.dtype = np.dtype(dtype)
+        if self.dtype not in (np.float64, np.float32):
+            raise ValueError(f"dtype is {self.dtype}: float64 or float32 is needed")
+        self.tables: dict[object, object] = {}  # what ``coordinates`` works out once for a constant model
+        self.phi = _stacked(phi, "phi", "n, n", self.dtype)
+        self.gamma = _stacked(gamma, "gamma", "n, p", self.dtype)
+        self.h = _stacked(h, "h", "m, n", self.dtype)
         self.n, self.p, self.m = self.phi.shape[2], self.gamma.shape[2], self.h.shape[1]
         for name, array, shape in (
             ("phi", self.phi, (self.n, self.n)),
@@ -88,7 +105,7 @@ class LinearModel:
         ):
             if array.shape[1:] != shape:
                 raise ValueError(f"{name} has shape {array.shape[1:]} per step, {shape} is needed")
-        self.q, self.r = _contiguous(q, "q"), _contiguous(r, "r")
+        self.q, self.r = _contiguous(q, "q", self.dtype), _contiguous(r, "r", self.dtype)
         lengths = {"phi": np.ndim(phi) == 3, "gamma": np.ndim(gamma) == 3, "h": np.ndim(h) == 3}
         self.steps = None
         for name, array, varies in (
@@ -118,15 +135,25 @@ class LinearModel:
                 raise ValueError(f"{name} is {wrong} at step {step}")
         if self.q.ndim == 3:
             count = max(self.q.shape[0], self.gamma.shape[0])
-            gamma, q = np.empty((count, self.n, self.p)), np.empty((count, self.p))
-            step = noise.absorb(self.q, self.gamma, TOLERANCE, gamma, q)
+            gamma, q = np.empty((count, self.n, self.p), self.dtype), np.empty((count, self.p), self.dtype)
+            step = noise.absorb(self.q, self.gamma, TOLERANCE * self.coarse, gamma, q)
             if step >= 0:
                 raise ValueError(f"q is not symmetric and positive semidefinite at step {step}")
             self.gamma, self.q = gamma, q
         if self.r.ndim == 3:
-            step = noise.definite(self.r, TOLERANCE)
+            step = noise.definite(self.r, TOLERANCE * self.coarse)
             if step >= 0:
                 raise ValueError(f"r is not symmetric and positive definite at step {step}")
+
+    @property
+    def eps(self) -> float:
+        """The rounding unit of ``dtype``."""
+        return float(np.finfo(self.dtype).eps)
+
+    @property
+    def coarse(self) -> float:
+        """How many times coarser ``dtype`` is than float64: 1, or 5e8."""
+        return float(self.eps / np.finfo(np.float64).eps)
 
     def __repr__(self) -> str:
         steps = "constant" if self.steps is None else f"{self.steps} steps"
@@ -139,36 +166,42 @@ class LinearModel:
         if not 0 <= first <= stop <= self.steps:
             raise IndexError(f"steps {first}..{stop} of a model of {self.steps} steps")
         part = LinearModel.__new__(LinearModel)
-        part.n, part.p, part.m, part.steps = self.n, self.p, self.m, stop - first
+        part.n, part.p, part.m, part.steps, part.dtype = self.n, self.p, self.m, stop - first, self.dtype
+        part.tables = {}
         for name in ("phi", "gamma", "q", "h", "r"):
             array = getattr(self, name)
             setattr(part, name, array[first:stop] if array.shape[0] == self.steps else array)
         return part
 
     def measurements(self, z: ArrayLike) -> Array:
-        """``z`` as a contiguous (N, m) array; ValueError when it does not fit the model."""
-        array = _contiguous(z, "z")
-        if array.ndim != 2 or array.shape[1] != self.m:
+        """``z`` as a contiguous (N, m) or (records, N, m) array; ValueError when it does not fit the model."""
+        array = _contiguous(z, "z", self.dtype)
+        if array.ndim not in (2, 3) or array.shape[-1] != self.m or array.shape[0] == 0 < array.ndim - 2:
             raise ValueError(f"z has shape {array.shape}, (N, {self.m}) is needed")
-        if self.steps is not None and array.shape[0] != self.steps:
-            raise ValueError(f"z has {array.shape[0]} rows, the model {self.steps} steps")
+        if self.steps is not None and array.shape[-2] != self.steps:
+            raise ValueError(f"z has {array.shape[-2]} rows, the model {self.steps} steps")
+        if np.isinf(array).any():
+            step = np.flatnonzero(np.isinf(array).any(axis=-1).reshape(-1, array.shape[-2]).any(axis=0))[0]
+            raise ValueError(f"z is infinite at step {step}; a missing measurement is NaN")
+        if array.ndim == 3 and (np.isnan(array) != np.isnan(array[0])).any():
+            raise ValueError("z: records that are filtered together miss the same measurements")
         return array
 
     def whitened(self, z: Array) -> tuple[Array, Array, Array]:
-        """Return h (1|N, m, n), variances r (1|N, m) and z (N, m), the correlation of r absorbed."""
+        """Return h (1|N, m, n), variances r (1|N, m) and z as given, the correlation of r absorbed."""
         if self.r.ndim == 2:
             return self.h, self.r, z
-        infinite = np.flatnonzero(np.isinf(z).any(axis=1))
-        if infinite.size:
-            raise ValueError(f"z is infinite at step {infinite[0]}; a missing measurement is NaN")
-        count = z.shape[0]
-        h, r, white = np.empty((count, self.m, self.n)), np.empty((count, self.m)), np.empty(z.shape)
-        noise.whiten(self.r, self.h, z, h, r, white)
+        one = z[0] if z.ndim == 3 else z
+        constant = self.r.shape[0] == self.h.shape[0] == 1 and not np.isnan(one).any()
+        count = 1 if constant else one.shape[0]
+        h, r = np.empty((count, self.m, self.n), self.dtype), np.empty((count, self.m), self.dtype)
+        white = np.array(z, order="C")
+        noise.whiten(self.r, self.h, one, h, r, white.reshape(-1, *one.shape))
         return h, r, white
 
 
-def _stacked(value: ArrayLike, name: str, shape: str) -> Array:
-    array = _contiguous(value, name)
+def _stacked(value: ArrayLike, name: str, shape: str, dtype: DTypeLike) -> Array:
+    array = _contiguous(value, name, dtype)
     if array.ndim == 2:
         return array[None]
     if array.ndim != 3:

@@ -19,9 +19,10 @@ def factored(matrix: Array, tolerance: float, definite: bool, u: Array, d: Array
     A pivot within ``tolerance`` of zero, measured by its own diagonal entry, is zero; its column must then be zero too.
     """
     k = d.size
+    slack = 1e-9 if matrix.itemsize == 8 else 1e-5
     for j in range(k):
         for i in range(j):
-            if not abs(matrix[i, j] - matrix[j, i]) <= 1e-9 * np.sqrt(abs(matrix[i, i] * matrix[j, j])):
+            if not abs(matrix[i, j] - matrix[j, i]) <= slack * np.sqrt(abs(matrix[i, i] * matrix[j, j])):
                 return False
     u[:, :] = matrix
     for j in range(k - 1, -1, -1):
@@ -51,7 +52,7 @@ def factored(matrix: Array, tolerance: float, definite: bool, u: Array, d: Array
 def absorb(q: Array, gamma: Array, tolerance: float, out_gamma: Array, out_q: Array) -> int:
     """Make Q diagonal: ``q`` (1|N, p, p), ``gamma`` (1|N, n, p) -> (K, n, p), (K, p). Returns a wrong step or -1."""
     p = q.shape[1]
-    u = np.empty((p, p))
+    u = np.empty((p, p), q.dtype)
     for i in range(out_q.shape[0]):
         if not factored(q[min(i, q.shape[0] - 1)], tolerance, False, u, out_q[i]):
             return i
@@ -69,7 +70,7 @@ def absorb(q: Array, gamma: Array, tolerance: float, out_gamma: Array, out_q: Ar
 def definite(r: Array, tolerance: float) -> int:
     """First step at which ``r`` (K, m, m) is not symmetric and positive definite, or -1."""
     m = r.shape[1]
-    u, d = np.empty((m, m)), np.empty(m)
+    u, d = np.empty((m, m), r.dtype), np.empty(m, r.dtype)
     for i in range(r.shape[0]):
         if not factored(r[i], tolerance, True, u, d):
             return i
@@ -78,31 +79,36 @@ def definite(r: Array, tolerance: float) -> int:
 
 @compiled
 def whiten(r: Array, h: Array, z: Array, out_h: Array, out_r: Array, out_z: Array) -> None:
-    """Make R diagonal: ``r`` (1|N, m, m), ``h`` (1|N, m, n), ``z`` (N, m) -> (N, m, n), (N, m), (N, m).
+    """Make R diagonal: ``r`` (1|N, m, m), ``h`` (1|N, m, n) -> (N, m, n), (N, m); ``out_z`` (K, N, m) is overwritten.
 
-    Only the block of R that belongs to the present scalars is factored: a masked scalar is a removed one.
+    Only the block of R that belongs to the present scalars, those of ``z`` (N, m), is factored: a masked scalar is a
+    removed one. With a single row in ``out_h`` nothing varies and nothing is missing.
     """
     m, n = h.shape[1], h.shape[2]
-    block, u, d = np.empty((m, m)), np.empty((m, m)), np.empty(m)
+    block, u, d = np.empty((m, m), r.dtype), np.empty((m, m), r.dtype), np.empty(m, r.dtype)
     kept = np.empty(m, np.int64)
+    count = 0
     for i in range(z.shape[0]):
-        now, rows = r[min(i, r.shape[0] - 1)], h[min(i, h.shape[0] - 1)]
-        count = 0
-        for c in range(m):
-            out_r[i, c] = 1.0
-            out_z[i, c] = z[i, c]
-            if not np.isnan(z[i, c]):
-                kept[count] = c
-                count += 1
-        for c in range(count):
-            for j in range(count):
-                block[c, j] = now[kept[c], kept[j]]
-        factored(block[:count, :count], 0.0, True, u[:count, :count], d[:count])
-        out_h[i] = rows
-        for c in range(count - 1, -1, -1):
-            own = kept[c]
-            out_r[i, own] = d[c]
-            for j in range(c + 1, count):
-                out_z[i, own] -= u[c, j] * out_z[i, kept[j]]
-                for column in range(n):
-                    out_h[i, own, column] -= u[c, j] * out_h[i, kept[j], column]
+        if i < out_h.shape[0]:
+            now, rows = r[min(i, r.shape[0] - 1)], h[min(i, h.shape[0] - 1)]
+            count = 0
+            for c in range(m):
+                out_r[i, c] = 1.0
+                if not np.isnan(z[i, c]):
+                    kept[count] = c
+                    count += 1
+            for c in range(count):
+                for j in range(count):
+                    block[c, j] = now[kept[c], kept[j]]
+            factored(block[:count, :count], 0.0, True, u[:count, :count], d[:count])
+            out_h[i] = rows
+            for c in range(count - 1, -1, -1):
+                own = kept[c]
+                out_r[i, own] = d[c]
+                for j in range(c + 1, count):
+                    for column in range(n):
+                        out_h[i, own, column] -= u[c, j] * out_h[i, kept[j], column]
+        for t in range(out_z.shape[0]):
+            for c in range(count - 1, -1, -1):
+                for j in range(c + 1, count):
+                    out_z[t, i, kept[c]] -= u[c, j] * out_z[t, i, kept[j]]

@@ -6,11 +6,14 @@ filtered state and no inverse of a filtered information matrix is needed, and a 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
 import numpy as np
 
 from estimator import sweeps
-from estimator.information import Carry
-from estimator.snapshots import Store
+from estimator.information import Carry, factors
+from estimator.snapshots import Shape, Store, Stretch
 from estimator.ud import Array
 
 
@@ -42,20 +45,89 @@ def unobserved(carry: Carry) -> tuple[Array, int]:
     Singular values of diag(L)^{-1/2} U D^{1/2}, whose rows have length 1 (or 0: a state nobody has seen). An oblique
     unobserved direction leaves a pivot of rounding size and not a zero, so D alone does not tell.
     """
-    u, d = carry.u[1:, 1:], carry.d[1:]
-    root = u * np.sqrt(d)
+    ut, d, phi = (array.astype(np.float64) for array in factors(carry))
+    n = d.size
+    root = ut[:, -n:].T * np.sqrt(d)
     length = np.sqrt((root * root).sum(axis=1))
     scale = np.where(length > 0.0, length, 1.0)
     left, values, _ = np.linalg.svd(root / scale[:, None])
-    count = int((values <= sweeps.FAINT * values[0]).sum()) if values[0] > 0.0 else d.size
+    faint = sweeps.limits(carry.d.dtype)[1]
+    count = int((values <= faint * values[0]).sum()) if values[0] > 0.0 else n
     direction = left[:, -1] / scale
     if (length == 0.0).any():  # such states are axes of the null space, and its plainest members
         direction = (length == 0.0) * (np.cumsum(length == 0.0) == 1) * 1.0
-    direction = carry.phi @ direction
+    direction = phi @ direction
     return direction / direction[np.argmax(np.abs(direction))], count
 
 
-def backward(store: Store, carry: Carry, *, first: int = 0, covariance: bool = True) -> tuple[Array, Array]:
+class Interval(NamedTuple):
+    """Steps ``first``.. smoothed, k of them; what was not asked for has no rows.
+
+    Attributes
+    ----------
+    mean : (k+1, n) array, or (records, k+1, n)
+        Epoch ``first``, where step ``first`` begins, is row 0.
+    std : (k+1, n) array
+    covariance : (k+1, n, n) array
+        Symmetric to the last bit.
+    cross : (k, n, n) array
+        cov(x_j, x_{j+1}).
+    """
+
+    mean: Array
+    std: Array
+    covariance: Array
+    cross: Array
+
+
+def stretches(
+    store: Store,
+    carry: Carry,
+    first: int,
+    std: bool,
+    covariance: bool,
+    cross: bool,
+    room: Callable[[int, int], Interval],
+) -> Iterator[tuple[int, Interval]]:
+    """Smooth from the newest step to step ``first``, one stretch of the store after the other.
+
+    ``room(a, b)`` gives the arrays for epochs a..b, mean (b-a+1, n, records); they are yielded with a when they are
+    full. All epochs are shown once: row 0 of every stretch but the last belongs to the next and is not written.
+    """
+    n, count = carry.phi.shape[0], len(store)
+    if not 0 <= first <= count:
+        raise IndexError(f"first is {first}: the store holds {count} steps")
+    if count and store.shape.n != n:
+        raise ValueError(f"carry has {n} states, the store {store.shape.n}")
+    store.check(carry.phi, carry.steps)
+    closed_by_hand = carry.steps == 0
+    if not closed_by_hand and store.begins[-1]:
+        raise ValueError("carry is not the one that the newest step of this store ended with")
+    ut, d, phi = factors(carry)
+    if not carry.regular or not (d > 0.0).all():
+        direction, unknown = unobserved(carry)
+        if unknown or not (d > 0.0).all():
+            raise Unobservable(direction, max(unknown, 1))
+    x, vt, weight = np.empty((n, ut.shape[1] - n), d.dtype), np.empty((n, n), d.dtype), np.empty(n, d.dtype)
+    sweeps.terminal(ut, d, x, vt, weight)
+    shape = store.shape if count else Shape(n, 0, x.shape[1], d.dtype)
+    last = Stretch(count, shape.rows(0)._replace(phi=phi[None]), np.zeros(1, np.int64), store.begins[-1:])
+    for stretch in store.backwards(first) if first < count else [last]:
+        rows, begins = stretch.rows, stretch.begins.copy()
+        stop = stretch.start + rows.qs.shape[0]
+        if closed_by_hand and stop == count:
+            begins[-1] = 1  # after the newest step: the store has not heard of it
+        out = room(stretch.start, stop)
+        sweeps.backward(
+            rows.phi, rows.e, stretch.at, rows.b, rows.g, rows.qs, begins, x, vt, weight, float(np.finfo(d.dtype).eps),
+            stretch.start == first, std, covariance, cross, *out,
+        )  # fmt: skip
+        yield stretch.start, out
+
+
+def backward(
+    store: Store, carry: Carry, *, first: int = 0, std: bool = False, covariance: bool = True, cross: bool = False
+) -> Interval:
     """Smooth the steps ``first``.. of the store, k of them, given everything up to ``carry``.
 
     Parameters
@@ -66,14 +138,8 @@ def backward(store: Store, carry: Carry, *, first: int = 0, covariance: bool = T
         From the last call of ``filter``, or that one anchored.
     first : int
         First step wanted, 0 <= first <= len(store).
-    covariance : bool
-        False returns standard deviations instead, for about two thirds of the time.
-
-    Returns
-    -------
-    mean : (k+1, n) array
-        Epoch ``first``, where step ``first`` begins, is row 0.
-    covariance : (k+1, n, n) array, symmetric to the last bit; or standard deviations, (k+1, n) array
+    std, covariance, cross : bool
+        What is wanted beside the mean. Without any of them no covariance is propagated.
 
     Raises
     ------
@@ -84,29 +150,20 @@ def backward(store: Store, carry: Carry, *, first: int = 0, covariance: bool = T
     IndexError
         ``first`` is negative or beyond the store.
     """
-    n, count = carry.d.size - 1, len(store)
-    if not 0 <= first <= count:
-        raise IndexError(f"first is {first}: the store holds {count} steps")
-    begins = store.begins[first:].copy()
-    steps = store.steps
-    if steps.phi.shape[0] == 0:
-        phi, e, b, g, qs = np.array(carry.phi)[None], *(np.empty((0, *field.shape[1:])) for field in steps[1:])
-    else:
-        if steps.phi.shape[1] != n:
-            raise ValueError(f"carry has {n} states, the store {steps.phi.shape[1]}")
-        store.check(carry.phi, carry.steps)
-        phi, e, b, g, qs = steps.phi[first:], *(field[first:] for field in steps[1:])
-    if carry.steps == 0:
-        begins[-1] = 1  # closed by hand after the newest step: the store has not heard of it
-    elif begins[-1]:
-        raise ValueError("carry is not the one that the newest step of this store ended with")
-    if not carry.regular or not (carry.d[1:] > 0.0).all():
-        direction, unknown = unobserved(carry)
-        if unknown or not (carry.d[1:] > 0.0).all():
-            raise Unobservable(direction, max(unknown, 1))
-    x, vt, d = np.empty(n), np.empty((n, n)), np.empty(n)
-    sweeps.terminal(np.array(carry.u.T, order="C"), np.array(carry.d), x, vt, d)
-    mean, std = np.empty((count - first + 1, n)), np.empty((count - first + 1, n))
-    square = np.empty((count - first + 1, n, n) if covariance else (0, n, n))
-    sweeps.backward(phi, e, b, g, qs, begins, x, vt, d, covariance, mean, std, square)
-    return mean, square if covariance else std
+    n, count = carry.phi.shape[0], len(store) - first
+    records, dtype = carry.d.size - n, carry.d.dtype
+    whole = Interval(
+        np.empty((count + 1, n, records), dtype),
+        np.empty((count + 1 if std else 0, n), dtype),
+        np.empty((count + 1 if covariance else 0, n, n), dtype),
+        np.empty((count if cross else 0, n, n), dtype),
+    )
+
+    def room(a: int, b: int) -> Interval:
+        epochs, steps = slice(a - first, b - first + 1), slice(a - first, b - first)
+        return Interval(whole.mean[epochs], whole.std[epochs], whole.covariance[epochs], whole.cross[steps])
+
+    for _ in stretches(store, carry, first, std, covariance, cross, room):
+        pass
+    mean = whole.mean[:, :, 0] if records == 1 else whole.mean.transpose(2, 0, 1)
+    return whole._replace(mean=mean)

@@ -447,7 +447,7 @@ class _Leg:
         self._late = [item for item in self._late if item[0] > when]
         closed = self._message(window, reason, dict(late))
         if self._epoch.scope == "window":
-            mean, std = backward(self._store, self._carry, covariance=False)
+            mean, std, *_ = backward(self._store, self._carry, std=True, covariance=False)
             yield self._smoothed(closed, mean[1:], std[1:])
             self._store.drop(len(self._store))
         else:
@@ -488,7 +488,7 @@ class _Leg:
         """One smoothing of the whole leg, told window by window."""
         if not self._closed:
             return
-        mean, std = backward(self._store, self._carry, covariance=False)
+        mean, std, *_ = backward(self._store, self._carry, std=True, covariance=False)
         first = 1
         for closed in self._closed:
             last = first + len(closed.t)

@@ -1,8 +1,9 @@
 """The compiled sweeps of MS-A: forward over N steps, hand-over at an anchor, backward over windows.
 
 MS-A is Shi's information filter in moving coordinates and its smoother [1]_, in augmented and sequential form: the data
-ride in slot 0 of the information matrix, L_aug = [[rho, d^T], [d, L]] = U_aug D_aug U_aug^T with U^T x* = eta in row 0
-of U_aug, and noise components and measurements enter one scalar at a time. Matrices are stored as in ``ud``.
+ride in front of the information factor, L = U D U^T with U^T x* = eta in the columns before U, and noise components and
+measurements enter one scalar at a time. K records with the same model, noise and missing samples differ in eta alone:
+they share every factor, and K = 1 is one record. Matrices are stored as in ``ud``; ``coordinates`` prepares the steps.
 
 References
 ----------
@@ -12,363 +13,427 @@ References
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
-from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator import ud
-from estimator.ud import Array, Order, agee_turner, bierman, compiled, factor, multiply, mwgs, solve, solve_transposed
+from estimator.coordinates import CONDITION, LENGTH, Flags
+from estimator.ud import (
+    Array,
+    Order,
+    agee_turner,
+    agee_turner_all,
+    bierman,
+    compiled,
+    factor,
+    mwgs,
+    solve,
+    solve_transposed,
+)
 
-# numba's on-disk cache asks only whether this file has changed, and would go on running the old code of a changed
-# callee. Making this file as young as the one it calls into is what its cache does notice.
-with suppress(OSError):
-    _callees = Path(ud.__file__).stat().st_mtime_ns
-    if Path(__file__).stat().st_mtime_ns < _callees:
-        os.utime(__file__, ns=(_callees, _callees))
-
-Flags = NDArray[np.uint8]
-
-DONE, SINGULAR, INFINITE, OVERFLOW = 0, 1, 2, 3  # how the forward sweep ended
-CONDITION, LENGTH = 1, 2  # bits of ``closed``: a window ended before this step, after it
-CHECK = 8  # steps between two exact condition numbers
-PIVOT = 1e-20  # of L_jj: a pivot below it is rounding (measured: 4e-23 and less), not information
-FAINT = 1e-8  # smallest singular value of the scaled factor that counts as observed: rounding alone reaches 3e-9 when
-# measurement variances range over 18 decades, 3e-12 otherwise; solvable problems stay above 1e-5
+ud.follow(__file__)
 
 
-@compiled
-def too_stiff(a: Array, lu: Array, order: Order, scale: Array, exact: bool, limit: float, w: Array) -> bool:
-    """Is the infinity-norm condition number of S^{-1} A S above ``limit``, S = diag(scale)? ``w`` (n, 2n) is scratch.
+PIVOT = {
+    8: 1e-20,
+    4: 1e-9,
+}  # of L_jj, by bytes per number: a pivot below it is rounding (measured in float64: 4e-23 and
+# less), not information
+FAINT = {8: 1e-8, 4: 1e-4}  # smallest singular value of the scaled factor that counts as observed: in float64 rounding
+# reaches 3e-9 when measurement variances range over 18 decades, 3e-12 otherwise; solvable problems stay above 1e-5
 
-    The n^3 inverse is formed only when asked for, or when pivots and norm say that the limit is near.
-    """
-    n = a.shape[0]
-    norm = 0.0
-    pivot = 0.0
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += abs(a[i, j]) * scale[j]
-        norm = max(norm, total / scale[i])
-        pivot = max(pivot, scale[order[i]] / (scale[i] * abs(lu[i, i])))
-    if not exact and 10.0 * norm * pivot < limit:
-        return False
-    w[:, :n] = 0.0
-    for i in range(n):
-        w[i, i] = 1.0
-    solve(lu, order, w[:, :n], w[:, n:])
-    inverse = 0.0
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += abs(w[i, n + j]) * scale[j]
-        inverse = max(inverse, total / scale[i])
-    return not norm * inverse <= limit
+
+def limits(dtype: np.dtype[Any]) -> tuple[float, float]:
+    """PIVOT and FAINT of a number type."""
+    return PIVOT[dtype.itemsize], FAINT[dtype.itemsize]
 
 
 @compiled
 def state(ut: Array, x: Array) -> None:
-    """Solve U^T x = eta for the star state ``x`` (n,); row j + 1 of the augmented ``ut`` begins with eta_j."""
-    for j in range(x.size):
-        t = ut[j + 1, 0]
+    """Solve U^T x = eta for the star states ``x`` (n, K); ``ut`` (n, K + n)."""
+    n, records = x.shape
+    if records == 1:
+        flat = x.reshape(n)
+        for j in range(n):
+            t = ut[j, 0]
+            for i in range(j):
+                t -= ut[j, 1 + i] * flat[i]
+            flat[j] = t
+        return
+    for j in range(n):
+        own = x[j]
+        for t in range(records):
+            own[t] = ut[j, t]
         for i in range(j):
-            t -= ut[j + 1, i + 1] * x[i]
-        x[j] = t
+            u, known = ut[j, records + i], x[i]
+            for t in range(records):
+                own[t] -= u * known[t]
 
 
 @compiled
-def rank(ut: Array, d: Array) -> int:
-    """Count the state pivots of the augmented factor that are information and not rounding (see PIVOT)."""
+def rank(ut: Array, d: Array, pivot: float) -> int:
+    """Count the pivots of the factor that are information and not rounding: above ``pivot``, measured by L_jj."""
+    n = d.size
+    data = ut.shape[1] - n
     count = 0
-    for j in range(1, d.size):
+    for j in range(n):
         total = 0.0
-        for k in range(j, d.size):
-            total += ut[k, j] * ut[k, j] * d[k]
-        if d[j] > PIVOT * total:
+        for k in range(j, n):
+            total += ut[k, data + j] * ut[k, data + j] * d[k]
+        if d[j] > pivot * total:
             count += 1
     return count
 
 
 @compiled
-def determined(ut: Array, d: Array, w: Array) -> bool:
-    """Is the smallest singular value of diag(L)^{-1/2} U D^{1/2} surely above FAINT? Needs full rank; ``w`` (n, n).
-
-    The Frobenius norm of the inverse bounds the smallest singular value from below.
-    """
-    n = d.size - 1
-    norm = 0.0
-    for j in range(n):  # w = U^{-T}, one row after the other: row j = e_j - sum_i U_ij row i
-        w[j, :] = 0.0
-        w[j, j] = 1.0
+def inverse(ut: Array, w: Array) -> None:
+    """Fill ``w`` (n, n) with U^{-T}: row j = e_j - sum_i U_ij row i."""
+    n = ut.shape[0]
+    data = ut.shape[1] - n
+    for j in range(n):
+        own = w[j]
+        own[:] = 0.0
+        own[j] = 1.0
         for i in range(j):
+            u, known = ut[j, data + i], w[i]
             for k in range(i + 1):
-                w[j, k] -= ut[j + 1, i + 1] * w[i, k]
-    for k in range(n):
-        length = 0.0
-        for j in range(k, n):
-            length += ut[j + 1, k + 1] * ut[j + 1, k + 1] * d[j + 1]
-        for j in range(k, n):
-            norm += w[j, k] * w[j, k] * length / d[j + 1]
-    return norm * n * FAINT * FAINT < 1.0
+                own[k] -= u * known[k]
 
 
 @compiled
-def anchor(ut: Array, d: Array, phi: Array, w: Array) -> None:
-    """Move the anchor to the present epoch: overwrite augmented ``ut`` and ``d``, set ``phi`` = I; ``w`` (n+1, 2n+2).
+def determined(ut: Array, d: Array, w: Array, faint: float) -> bool:
+    """Is the smallest singular value of diag(L)^{-1/2} U D^{1/2} surely above ``faint``? Full rank; ``w`` (n, n).
 
-    V = diag(1, phi^{-T}) U_aug, then mwgs; the state and its covariance do not change. Row 0 of the result is exact but
-    amplifies rounding, so eta is formed again from the state, unless the two disagree by more than a thousandth of a
-    sigma: then pivots of rounding size stand for directions nobody has seen, and row 0 is the better one.
+    The Frobenius norm of the inverse bounds the smallest singular value from below.
+    """
+    n = d.size
+    data = ut.shape[1] - n
+    norm = 0.0
+    inverse(ut, w)
+    for k in range(n):
+        length = 0.0
+        for j in range(k, n):
+            length += ut[j, data + k] * ut[j, data + k] * d[j]
+        for j in range(k, n):
+            norm += w[j, k] * w[j, k] * length / d[j]
+    return norm * n * faint * faint < 1.0
+
+
+@compiled
+def anchor(ut: Array, d: Array, phi: Array, regular: bool, eps: float) -> None:
+    """Move the anchor to the present epoch: overwrite ``ut`` (n, K + n) and ``d``; ``phi`` (n, n) = phi_{j,0}.
+
+    V = diag(I, phi^{-T}) [eta^T; U], then mwgs; states and their covariance do not change. The eta that comes out is
+    exact but amplifies rounding, so it is formed again from the state. Not while some direction is unknown (``regular``
+    is false): pivots of rounding size stand for it then, and the state is nonsense along it; nor when the two disagree
+    by more than a thousandth of a sigma.
     """
     n = phi.shape[0]
-    v, spare = w[:, : n + 1], w[:, n + 1 :]
-    lu = np.empty((n, n))
-    order = np.empty(n, np.int64)
-    x, b, weight = np.empty(n), np.empty(n), d.copy()
-    factor(phi, lu, order)
-    informed = True
-    v[:, :] = 0.0
-    v[0, 0] = 1.0
+    data = ut.shape[1] - n
+    v, weight = np.empty((data + n, n), phi.dtype), np.empty(n, phi.dtype)
+    lu, order = np.empty((n, n), phi.dtype), np.empty(n, np.int64)
+    x, moved = np.empty((n, data), phi.dtype), np.empty((n, data), phi.dtype)
+    b, column = np.empty(n, phi.dtype), np.empty(n, phi.dtype)
+    factor(phi, lu, order, eps)
+    informed = regular
     for j in range(n):
-        informed = informed and d[j + 1] > 0.0
-        v[0, j + 1] = ut[j + 1, 0]
-        b[:] = ut[j + 1, 1:]
-        solve_transposed(lu, order, b, x)
-        v[1:, j + 1] = x
+        informed = informed and d[j] > 0.0
+        weight[j] = d[j]
+        for t in range(data):
+            v[t, j] = ut[j, t]
+        for i in range(n):
+            b[i] = ut[j, data + i]
+        solve_transposed(lu, order, b, column)
+        for i in range(n):
+            v[data + i, j] = column[i]
     state(ut, x)
-    for i in range(n):
-        b[i] = 0.0
-        for j in range(n):
-            b[i] += phi[i, j] * x[j]
+    np.dot(phi, x, moved)
     mwgs(v, weight, ut, d)
-    d[0] = weight[0]
     for j in range(n):
-        eta = 0.0
-        for i in range(j + 1):
-            eta += ut[j + 1, i + 1] * b[i]
-        spare[0, j] = eta
-        informed = informed and abs(eta - ut[j + 1, 0]) * np.sqrt(d[j + 1]) < 1e-3
+        for t in range(data):
+            eta = moved[j, t]
+            for i in range(j):
+                eta += ut[j, data + i] * moved[i, t]
+            x[j, t] = eta
+            informed = informed and abs(eta - ut[j, t]) * np.sqrt(d[j]) < 1e-3
     if informed:
-        ut[1:, 0] = spare[0, :n]
-    phi[:, :] = 0.0
-    for i in range(n):
-        phi[i, i] = 1.0
+        for j in range(n):
+            for t in range(data):
+                ut[j, t] = x[j, t]
 
 
 @compiled
 def spread(ut: Array, d: Array, phi: Array, w: Array, std: Array) -> None:
     """Fill ``std`` (n,) with the roots of the diagonal of phi L^{-1} phi^T; ``w`` (n, n) is scratch."""
     n = phi.shape[0]
+    data = ut.shape[1] - n
     std[:] = 0.0
     for j in range(n):
-        w[j, :] = phi[:, j]
-    for j in range(n - 1, -1, -1):  # w = (phi U^{-T})^T, back substitution on all rows of phi at once
-        for i in range(j):
-            t = ut[j + 1, i + 1]
-            if t != 0.0:
-                for k in range(n):
-                    w[i, k] -= t * w[j, k]
+        own = w[j]
         for k in range(n):
-            std[k] += w[j, k] * w[j, k] / d[j + 1]
+            own[k] = phi[k, j]
+    for j in range(n - 1, -1, -1):  # w = (phi U^{-T})^T, back substitution on all rows of phi at once
+        done = w[j]
+        for i in range(0, j - 1, 2):
+            t, s, one, two = ut[j, data + i], ut[j, data + i + 1], w[i], w[i + 1]
+            for k in range(n):
+                one[k] -= t * done[k]
+                two[k] -= s * done[k]
+        if j % 2 == 1:
+            t, one = ut[j, data + j - 1], w[j - 1]
+            for k in range(n):
+                one[k] -= t * done[k]
+        weight = 1.0 / d[j]
+        for k in range(n):
+            std[k] += done[k] * done[k] * weight
     for k in range(n):
         std[k] = np.sqrt(std[k])
 
 
 @compiled
 def forward(
-    phi: Array, gamma: Array, q: Array, h: Array, r: Array, z: Array,
-    ut: Array, d: Array, since: Array, steps: int, regular: bool, longest: int, limit: float, scale: Array,
-    keep: bool, kept_phi: Array, kept_e: Array, kept_b: Array, kept_g: Array, kept_qs: Array,
-    estimates: bool, mean: Array, std: Array, nis: Array, dof: Order, closed: Flags,
-) -> tuple[int, bool, int, int]:  # fmt: skip
-    """Filter N steps: the forward pass of MS-A.
+    ends: Array, es: Array, at: Order, rows: Array, seen: Order, q: Array, r: Array, z: Array, closed: Flags,
+    ut: Array, d: Array, rho: Array, since: Array, regular: bool, pivot: float, faint: float, eps: float,
+    keep: bool, kept_b: Array, kept_g: Array, kept_qs: Array,
+    estimates: bool, mean: Array, std: Array, nis: Array, dof: Order,
+) -> tuple[bool, int]:  # fmt: skip
+    """Filter N steps of K records: the forward pass of MS-A, in prepared coordinates.
 
-    Per step, in star coordinates x = phi_{j,0} x*: E = phi_{j+1,0}^{-1} Gamma_j, M = H phi_{j+1,0}; one bierman
-    downdate of L_aug per noise component, [0, E_c] and 1/q_c; one agee_turner update per present scalar, [z_i, M_i].
+    Per step one bierman downdate of L per noise component, E_c and 1/q_c, and one agee_turner update per present
+    scalar, [z_i, M_i] and 1/r_i.
 
     Parameters
     ----------
-    phi (1|N, n, n), gamma (1|N, n, p), q (1|N, p), h (1|N, m, n), r (1|N, m), z (N, m)
-    ut (n+1, n+1), d (n+1,), since (n, n) = phi_{j,0} : the carry, overwritten
-    kept_phi (N, n, n), kept_e, kept_b (N, p, n), kept_g, kept_qs (N, p) : rows of the store, written when ``keep``
-    mean, std (N, n), written when ``estimates``; nis, dof (N,); closed (N,) : bits CONDITION and LENGTH
+    ends (T, n, n), es (T, p, n), at (N,) : phi_{j+1,0} and E_j^T of step i are rows at[i]
+    rows (S, m, n), seen (N,) : M of step i is row seen[i]
+    q (1|N, p), r (1|N, m), z (N, m, K), closed (N,) : bits CONDITION and LENGTH say when to anchor
+    ut (n, K+n), d (n,), rho (K,) : the carry, overwritten; since (n, n) = phi_{j,0} of the epoch before the first step
+    pivot, faint : see ``rank`` and ``determined``; eps : the rounding unit
+    kept_b (N, p, n), kept_g (N, p, K), kept_qs (N, p) : rows of the store, written when ``keep``
+    mean (N, n, K), std (N, n), written when ``estimates``; nis (N, K), dof (N,)
 
     Returns
     -------
-    steps since the anchor; whether every direction is known; how the sweep ended, and at which step
+    whether every direction is known, and the first step whose result is not finite, or -1
     """
-    n, p, m = since.shape[0], gamma.shape[2], h.shape[1]
-    end, lu, order, x = np.empty((n, n)), np.empty((n, n)), np.empty(n, np.int64), np.empty(n)
-    w, wide, scratch = np.empty((n, 2 * n)), np.empty((n + 1, 2 * n + 2)), np.empty((n, n))
-    e, rows = np.empty((n, p)), np.empty((m, n))
-    a, k = np.empty(n + 1), np.empty(n + 1)
-    for i in range(z.shape[0]):
-        now = phi[min(i, phi.shape[0] - 1)]
-        closed[i] = 0
-        if steps > 0:
-            multiply(now, since, end)
-            bad = factor(end, lu, order)
-            if bad or too_stiff(end, lu, order, scale, (steps + 1) % CHECK == 0, limit, w):
-                anchor(ut, d, since, wide)
-                closed[i] = CONDITION
-                steps = 0
-        if steps == 0:
-            end[:, :] = now
-            if factor(end, lu, order):
-                return steps, regular, SINGULAR, i
-        solve(lu, order, gamma[min(i, gamma.shape[0] - 1)], e)
-        variance = q[min(i, q.shape[0] - 1)]
+    n, p, m = d.size, es.shape[1], rows.shape[1]
+    data = ut.shape[1] - n
+    scratch, x = np.empty((n, n), ut.dtype), np.empty((n, data), ut.dtype)
+    a, weight, k = np.empty((m, data + n), ut.dtype), np.empty(m, ut.dtype), np.empty(data + n, ut.dtype)
+    for i in range(at.size):
+        if closed[i] & CONDITION:
+            anchor(ut, d, since, regular, eps)
+        since = ends[at[i]]
+        variance, e = q[min(i, q.shape[0] - 1)], es[at[i]]
         for c in range(p):
             if variance[c] > 0.0:
-                a[0] = 0.0
-                for j in range(n):
-                    a[j + 1] = e[j, c]
-                sigma = bierman(ut, d, a, 1.0 / variance[c], k)
+                qs = 1.0 / bierman(ut, d, e[c], 1.0 / variance[c], k)
                 if keep:
-                    kept_qs[i, c] = 1.0 / sigma
-                    kept_g[i, c] = k[0] / sigma
+                    kept_qs[i, c] = qs
+                    for t in range(data):
+                        kept_g[i, c, t] = k[t] * qs
                     for j in range(n):
-                        kept_e[i, c, j] = e[j, c]
-                        kept_b[i, c, j] = k[j + 1] / sigma
+                        kept_b[i, c, j] = k[data + j] * qs
             elif keep:
-                kept_qs[i, c] = kept_g[i, c] = 0.0
-                kept_e[i, c, :] = 0.0
+                kept_qs[i, c] = 0.0
+                kept_g[i, c, :] = 0.0
                 kept_b[i, c, :] = 0.0
-        multiply(h[min(i, h.shape[0] - 1)], end, rows)
-        variance = r[min(i, r.shape[0] - 1)]
-        nis[i] = 0.0
-        dof[i] = 0
-        for c in range(m):
-            if abs(z[i, c]) == np.inf:
-                return steps, regular, INFINITE, i
-            if not np.isnan(z[i, c]):
-                a[0] = z[i, c]
-                a[1:] = rows[c]
-                before = n if regular else rank(ut, d)
-                added = agee_turner(ut, d, a, 1.0 / variance[c])
-                if regular or rank(ut, d) == before:  # else it told a new direction and was compared with nothing
-                    nis[i] += added
-                    dof[i] += 1
-        since[:, :] = end
-        steps += 1
-        if keep:
-            kept_phi[i] = end
+        variance, row = r[min(i, r.shape[0] - 1)], rows[seen[i]]
         total = 0.0
-        for j in range(n + 1):
+        disagreement = nis[i]
+        disagreement[:] = 0.0
+        dof[i] = 0
+        count = 0
+        for c in range(m):
+            if z[i, c, 0] == z[i, c, 0]:
+                for t in range(data):
+                    a[count, t] = z[i, c, t]
+                for j in range(n):
+                    a[count, data + j] = row[c, j]
+                weight[count] = 1.0 / variance[c]
+                count += 1
+        known = n
+        if regular:
+            agee_turner_all(ut, d, a, weight, count)
+        for c in range(count):
+            if not regular:
+                known = rank(ut, d, pivot)
+                weight[c] = agee_turner(ut, d, a[c], weight[c])
+            new = not regular and rank(ut, d, pivot) != known
+            dof[i] += not new
+            for t in range(data):
+                square = weight[c] * a[c, t] * a[c, t]
+                rho[t] += square
+                total += square
+                if not new:  # what tells a new direction is compared with nothing
+                    disagreement[t] += square
+        for j in range(n):
             total += d[j]
         if not abs(total) < np.inf:  # np.isfinite is x - x == x - x inside, which 'reassoc' is free to call 0
-            return steps, regular, OVERFLOW, i
-        if not regular and rank(ut, d) == n:
-            regular = determined(ut, d, scratch)
+            return regular, i
+        if not regular and rank(ut, d, pivot) == n:
+            regular = determined(ut, d, scratch, faint)
         if estimates:
             if regular:
                 state(ut, x)
-                for row in range(n):
-                    total = 0.0
-                    for j in range(n):
-                        total += end[row, j] * x[j]
-                    mean[i, row] = total
-                spread(ut, d, end, scratch, std[i])
+                np.dot(since, x, mean[i])
+                spread(ut, d, since, scratch, std[i])
             else:
-                mean[i, :] = np.nan
+                mean[i, :, :] = np.nan
                 std[i, :] = np.inf
-        if steps >= longest:
-            anchor(ut, d, since, wide)
-            closed[i] |= LENGTH
-            steps = 0
-    return steps, regular, DONE, z.shape[0]
+        if closed[i] & LENGTH:
+            anchor(ut, d, since, regular, eps)
+    return regular, -1
 
 
 @compiled
 def terminal(ut: Array, d: Array, x: Array, vt: Array, dv: Array) -> None:
-    """Start the way back: x* from U^T x* = eta, and P* = L^{-1} as ``vt`` (n, n), ``dv`` (n,). Needs all D > 0."""
-    n = x.size
-    w, weight = np.empty((n, n)), np.empty(n)
+    """Start the way back: x* (n, K) from U^T x* = eta, and P* = L^{-1} as ``vt`` (n, n), ``dv`` (n,). All D > 0."""
+    n = d.size
+    w, weight = np.empty((n, n), ut.dtype), np.empty(n, ut.dtype)
     state(ut, x)
-    for j in range(n):  # U^{-T}: row j = e_j - sum_i U_ij row i
-        w[j, :] = 0.0
-        w[j, j] = 1.0
-        for i in range(j):
-            for k in range(i + 1):
-                w[j, k] -= ut[j + 1, i + 1] * w[i, k]
-        weight[j] = 1.0 / d[j + 1]
+    inverse(ut, w)
+    for j in range(n):
+        weight[j] = 1.0 / d[j]
     mwgs(w, weight, vt, dv)
 
 
 @compiled
+def advance(x: Array, e: Array, b: Array, g: Array, row: int, i: int, c: int, miss: Array) -> None:
+    """x* <- x* + e (g - b^T x*) for component ``c`` of step ``i``, whose e is in ``row``; ``miss`` (K,) is scratch."""
+    n, records = x.shape
+    if records == 1:
+        t = g[i, c, 0]
+        for j in range(n):
+            t -= b[i, c, j] * x[j, 0]
+        for j in range(n):
+            x[j, 0] += e[row, c, j] * t
+        return
+    for t in range(records):
+        miss[t] = g[i, c, t]
+    for j in range(n):
+        for t in range(records):
+            miss[t] -= b[i, c, j] * x[j, t]
+    for j in range(n):
+        for t in range(records):
+            x[j, t] += e[row, c, j] * miss[t]
+
+
+@compiled
+def image(phi: Array, vt: Array, u: Array, w: Array) -> None:
+    """Fill ``w`` (n, n) with phi U; ``u`` is scratch: a product of plain matrices is twice as fast as one with U^T."""
+    n = phi.shape[0]
+    for i in range(n):
+        for j in range(n):
+            u[i, j] = vt[j, i]
+    np.dot(phi, u, w)
+
+
+@compiled
+def outer(w: Array, heavy: Array, out: Array) -> None:
+    """Fill ``out`` (n, n) with w heavy^T, known to be symmetric: one triangle, mirrored, symmetric to the last bit."""
+    n = w.shape[0]
+    for row in range(n):
+        for c in range(row + 1):
+            t = 0.0
+            for j in range(n):
+                t += heavy[row, j] * w[c, j]
+            out[row, c] = t
+            out[c, row] = t
+
+
+@compiled
 def backward(
-    phi: Array, e: Array, b: Array, g: Array, qs: Array, begins: Flags, x: Array, vt: Array, d: Array,
-    full: bool, mean: Array, std: Array, covariance: Array,
+    phi: Array, e: Array, at: Order, b: Array, g: Array, qs: Array, begins: Flags,
+    x: Array, vt: Array, d: Array, eps: float, lowest: bool, spreads: bool, full: bool, crossed: bool,
+    mean: Array, std: Array, covariance: Array, cross: Array,
 ) -> None:  # fmt: skip
-    """Smooth K stored steps, from the last epoch to the first, across any number of anchors.
+    """Smooth k stored steps of K records, from the last epoch to the first, across any number of anchors.
 
     Per noise component, last one first: x* <- x* + e (g - b^T x*) and
     P* <- (I - e b^T) P* (I - e b^T)^T + qs e e^T = (P* - k k^T / s) + s (e - k/s)(e - k/s)^T with k = P* b,
-    s = qs + b^T P* b: one downdate and one update, no subtraction of covariances.
+    s = qs + b^T P* b: one downdate and one update, no subtraction of covariances. The covariance of neighbours is
+    phi_{j,0} A P* phi_{j+1,0}^T, A = prod (I - e b^T).
 
     Parameters
     ----------
-    phi (K+1, n, n) : transition from the anchor of the window that ends or goes on at each epoch
-    e, b (K, p, n), g, qs (K, p), begins (K+1,) : the store; ``begins[i]``: a window starts with step i
-    x (n,), vt (n, n), d (n,) : star state and covariance at epoch K, overwritten
-    mean, std (K+1, n); covariance (K+1, n, n), written when ``full``
+    phi (T+1, n, n), e (T, p, n), at (k+1,) : transition from the anchor of the window that ends or goes on at epoch i
+        is row at[i] of phi, and E of the step that ends there row at[i] - 1 of e
+    b (k, p, n), g (k, p, K), qs (k, p), begins (k+1,) : the store; ``begins[i]``: a window starts with step i
+    x (n, K), vt (n, n), d (n,) : star states and covariance at epoch k, overwritten with those of epoch 0
+    lowest : whether to show epoch 0, which otherwise is the last one of the steps before
+    mean (k+1, n, K); std (k+1, n), covariance (k+1, n, n), cross (k, n, n) : written when asked for
     """
-    n, last = x.size, e.shape[0]
-    lu, order = np.empty((n, n)), np.empty(n, np.int64)
-    k, column, moved = np.empty(n), np.empty((n, 1)), np.empty((n, 1))
-    w, pair, weight = np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    n, last, p = d.size, qs.shape[0], qs.shape[1]
+    lu, order = np.empty((n, n), x.dtype), np.empty(n, np.int64)
+    k, miss, moved = np.empty(n, x.dtype), np.empty(x.shape[1], x.dtype), np.empty(x.shape, x.dtype)
+    w, pair, z = np.empty((n, n), x.dtype), np.empty((n, n), x.dtype), np.empty((n, n), x.dtype)
+    weight, line = np.empty(n, x.dtype), np.empty(n, x.dtype)
+    factors = spreads or full or crossed
     for i in range(last, -1, -1):
-        for row in range(n):  # w = phi U and pair = w D: x = phi x*, P = w pair^T
-            total = 0.0
+        if i == 0 and not lowest:
+            return
+        if begins[i]:
+            mean[i] = x
+        else:
+            np.dot(phi[at[i]], x, mean[i])
+        if factors:  # w = phi U and pair = w D: P = w pair^T
             if begins[i]:
-                total = x[row]
-            else:
-                for j in range(n):
-                    total += phi[i, row, j] * x[j]
-            mean[i, row] = total
-            variance = 0.0
-            for j in range(n):
-                if begins[i]:
-                    total = vt[j, row]
-                else:
-                    total = phi[i, row, j]
-                    for c in range(j):
-                        total += phi[i, row, c] * vt[j, c]
-                w[row, j] = total
-                pair[row, j] = total * d[j]
-                variance += total * total * d[j]
-            std[i, row] = np.sqrt(variance)
-            if full:  # one triangle, mirrored: symmetric to the last bit
-                for c in range(row + 1):
-                    total = 0.0
+                for row in range(n):
                     for j in range(n):
-                        total += w[row, j] * pair[c, j]
-                    covariance[i, row, c] = total
-                    covariance[i, c, row] = total
+                        w[row, j] = vt[j, row]
+            else:
+                image(phi[at[i]], vt, z, w)
+            for row in range(n):
+                variance = 0.0
+                for j in range(n):
+                    pair[row, j] = w[row, j] * d[j]
+                    variance += w[row, j] * pair[row, j]
+                if spreads:
+                    std[i, row] = np.sqrt(variance)
+        if full:
+            outer(w, pair, covariance[i])
         if i == 0:
             return
+        now = phi[at[i]]
         if begins[i]:  # the state at the anchor, in the coordinates of the window before: x* = phi_{k,0}^{-1} x
-            factor(phi[i], lu, order)
-            column[:, 0] = x
-            solve(lu, order, column, moved)
-            x[:] = moved[:, 0]
+            factor(now, lu, order, eps)
+            moved[:, :] = x
+            solve(lu, order, moved, x)
+            if factors:
+                for row in range(n):
+                    for j in range(n):
+                        pair[row, j] = vt[j, row]
+                solve(lu, order, pair, w)
+                weight[:] = d
+                mwgs(w, weight, vt, d)
+        if crossed:  # z = P* phi^T
+            image(now, vt, z, w)
             for row in range(n):
                 for j in range(n):
-                    pair[row, j] = vt[j, row]
-            solve(lu, order, pair, w)
-            weight[:] = d
-            mwgs(w, weight, vt, d)
-        for c in range(e.shape[1] - 1, -1, -1):
+                    pair[j, row] = w[row, j] * d[j]
+            for row in range(n):
+                for j in range(n):
+                    w[row, j] = vt[j, row]
+            np.dot(w, pair, z)
+        step = e[at[i] - 1]
+        for c in range(p - 1, -1, -1):
             if qs[i - 1, c] > 0.0:
-                miss = g[i - 1, c]
-                for j in range(n):
-                    miss -= b[i - 1, c, j] * x[j]
-                for j in range(n):
-                    x[j] += e[i - 1, c, j] * miss
-                s = bierman(vt, d, b[i - 1, c], qs[i - 1, c], k)
-                for j in range(n):
-                    k[j] = e[i - 1, c, j] - k[j] / s
-                agee_turner(vt, d, k, s)
+                own = step[c]
+                advance(x, e, b, g, at[i] - 1, i - 1, c, miss)
+                if factors:
+                    s = bierman(vt, d, b[i - 1, c], qs[i - 1, c], k)
+                    for j in range(n):
+                        k[j] = own[j] - k[j] / s
+                    agee_turner(vt, d, k, s)
+                if crossed:
+                    np.dot(b[i - 1, c], z, line)
+                    for row in range(n):
+                        for j in range(n):
+                            z[row, j] -= own[row] * line[j]
+        if crossed:
+            if begins[i - 1]:
+                cross[i - 1] = z
+            else:
+                np.dot(phi[at[i - 1]], z, cross[i - 1])

@@ -1,10 +1,14 @@
 """U-D kernels: what the information filter and its smoother are made of, compiled.
 
 A symmetric matrix is held as U diag(d) U^T with U unit upper triangular. The array is always ``ut``, the transpose of U
-(``ut[j, i] = U[i, j]``): every loop below runs down a column of U, which is then a contiguous row. Matrices are
-C-contiguous float64; nothing is allocated inside a loop.
+(``ut[j, i] = U[i, j]``): every loop below runs down a column of U, which is then a contiguous row. A factor may carry
+data: ``ut`` (n, K + n) has K columns in front, row j = [eta_j of K records, U_0j .. U_jj, 0 ..], and whatever is done
+to the columns of U is done to them. K = 0 is the plain factor.
 
-Nothing here calls anything else here; the sweeps over many steps that call all of it are in ``sweeps``.
+Matrices are C-contiguous, float64 or float32; nothing is allocated inside a loop. Where one array is read and written,
+rows are cut out as slices, because loops over them are vectorised; where several arrays are, indices are faster.
+
+The sweeps over many steps that call all of it are in ``sweeps``.
 
 References
 ----------
@@ -14,14 +18,17 @@ References
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import ParamSpec, TypeVar, cast
 
 import numpy as np
 from numba import njit  # type: ignore[import-untyped, unused-ignore]
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.float64]  # or float32: a model says which, and everything made from it follows
 Order = NDArray[np.int64]
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -32,24 +39,41 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
     return cast(Callable[P, T], njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})(function))
 
 
+def follow(caller: str) -> None:
+    """Make the file ``caller``, whose kernels call those here, at least as young as this one.
+
+    numba's on-disk cache asks only whether the caller's own file has changed, and would go on running the old code of a
+    changed callee.
+    """
+    with suppress(OSError):
+        here = Path(__file__).stat().st_mtime_ns
+        if Path(caller).stat().st_mtime_ns < here:
+            os.utime(caller, ns=(here, here))
+
+
 @compiled
 def bierman(ut: Array, d: Array, h: Array, r: float, k: Array) -> float:
     """Downdate P = U D U^T by one scalar: P <- P - P h h^T P / s, s = r + h^T P h [1]_. Needs r > 0.
 
-    Overwrites ``ut`` (n, n) and ``d`` (n,); fills ``k`` (n,) with P h of the old P; returns s.
+    Overwrites ``ut`` (n, K + n) and ``d`` (n,); ``h`` is (n,). Fills ``k`` (K + n,): P h of the old P, and in the K
+    places in front what the data say of it, eta^T D U^T h. Returns s.
     """
+    n = d.size
+    data = ut.shape[1] - n
     a = r
-    for j in range(d.size):
+    for i in range(data):
+        k[i] = 0.0
+    for j in range(n):
         f = h[j]
         for i in range(j):
-            f += ut[j, i] * h[i]
+            f += ut[j, data + i] * h[i]
         v = d[j] * f
-        k[j] = v
+        k[data + j] = v
         if v != 0.0:
             grown = a + f * v
             d[j] *= a / grown
             gain = f / a
-            for i in range(j):
+            for i in range(data + j):
                 t = ut[j, i]
                 ut[j, i] = t - gain * k[i]
                 k[i] += v * t
@@ -59,13 +83,17 @@ def bierman(ut: Array, d: Array, h: Array, r: float, k: Array) -> float:
 
 @compiled
 def agee_turner(ut: Array, d: Array, a: Array, c: float) -> float:
-    """Update U D U^T <- U D U^T + c a a^T, c >= 0. Overwrites ``ut``, ``d`` and ``a``; returns what was added to d[0].
+    """Update U D U^T <- U D U^T + c a a^T, c >= 0. Overwrites ``ut`` (n, K + n), ``d`` (n,) and ``a`` (K + n,).
 
-    Both branches are one number in exact arithmetic (1 - beta s = rho). The second is the composite of Fletcher and
-    Powell [2]_: without it a datum that dwarfs the pivot, and every start without prior, loses all digits.
+    Returns the weight that is left: of the K data in front of ``a`` it leaves residuals, whose squares times that
+    weight are what the scalar disagrees with all that was known. Both branches are one number in exact arithmetic
+    (1 - beta s = rho). The second is the composite of Fletcher and Powell [2]_: without it a datum that dwarfs the
+    pivot, and every start without prior, loses all digits.
     """
-    for j in range(d.size - 1, 0, -1):
-        s = a[j]
+    n = d.size
+    data = ut.shape[1] - n
+    for j in range(n - 1, -1, -1):
+        s = a[data + j]
         if s == 0.0:
             continue
         v = c * s
@@ -77,62 +105,109 @@ def agee_turner(ut: Array, d: Array, a: Array, c: float) -> float:
         c *= rho
         d[j] = dn
         if rho > 0.25:
-            for i in range(j):
+            for i in range(data + j):
                 t = a[i] - s * ut[j, i]
                 a[i] = t
                 ut[j, i] += beta * t
         else:
-            for i in range(j):
+            for i in range(data + j):
                 t = a[i]
                 a[i] = t - s * ut[j, i]
                 ut[j, i] = rho * ut[j, i] + beta * t
         if c == 0.0:
-            return 0.0
-    added: float = c * a[0] * a[0]
-    d[0] += added
-    return added
+            break
+    return c
+
+
+@compiled
+def agee_turner_all(ut: Array, d: Array, a: Array, c: Array, count: int) -> None:
+    """The updates of ``agee_turner`` with the first ``count`` rows of ``a`` (k, K + n), weights ``c`` (k,), in order.
+
+    Leaves in ``a`` the residuals and in ``c`` the weights that are left. Column by column instead of row by row: the
+    numbers are the same, but the short chains of dependent operations of several rows overlap.
+    """
+    n = d.size
+    data = ut.shape[1] - n
+    for j in range(n - 1, -1, -1):
+        for b in range(count):
+            s = a[b, data + j]
+            v = c[b] * s
+            if v == 0.0:
+                continue
+            dn = d[j] + v * s
+            beta = v / dn
+            rho = d[j] / dn
+            c[b] *= rho
+            d[j] = dn
+            if rho > 0.25:
+                for i in range(data + j):
+                    t = a[b, i] - s * ut[j, i]
+                    a[b, i] = t
+                    ut[j, i] += beta * t
+            else:
+                for i in range(data + j):
+                    t = a[b, i]
+                    a[b, i] = t - s * ut[j, i]
+                    ut[j, i] = rho * ut[j, i] + beta * t
 
 
 @compiled
 def mwgs(w: Array, weight: Array, ut: Array, d: Array) -> None:
-    """Modified weighted Gram-Schmidt [1]_: W diag(weight) W^T = U D U^T for ``w`` (n, k), which is overwritten.
+    """Modified weighted Gram-Schmidt [1]_: W diag(weight) W^T = U D U^T for ``w`` (K + n, k), which is overwritten.
 
-    Fills ``ut`` (n, n) and ``d`` (n,). A row that is nothing but the later rows gives a zero pivot and a zero column.
+    Fills ``ut`` (n, K + n) and ``d`` (n,). A row that is nothing but the later rows gives a zero pivot and a zero
+    column. The first K rows are data: they are expressed by the others and have no pivots.
     """
-    n, count = w.shape
+    n, count = d.size, w.shape[1]
+    data = w.shape[0] - n
+    heavy = np.empty(count, w.dtype)
     for j in range(n - 1, -1, -1):
+        row = w[data + j]
         total = 0.0
         for k in range(count):
-            total += w[j, k] * w[j, k] * weight[k]
+            heavy[k] = row[k] * weight[k]
+            total += row[k] * heavy[k]
         d[j] = total
         ut[j, :] = 0.0
-        ut[j, j] = 1.0
+        ut[j, data + j] = 1.0
         if total > 0.0:
-            for i in range(j):
+            for i in range(data + j):
+                other = w[i]
                 dot = 0.0
                 for k in range(count):
-                    dot += w[i, k] * (w[j, k] * weight[k])
+                    dot += other[k] * heavy[k]
                 dot /= total
                 ut[j, i] = dot
                 for k in range(count):
-                    w[i, k] -= dot * w[j, k]
+                    other[k] -= dot * row[k]
 
 
 @compiled
-def factor(a: Array, lu: Array, order: Order) -> bool:
+def faint(a: Array, column: int, pivot: float, few: float) -> bool:
+    """Is the square of ``pivot`` not above ``few`` times that of the largest entry of its column of ``a``?"""
+    largest = 0.0
+    for i in range(a.shape[0]):
+        largest = max(largest, abs(a[i, column]))
+    return not abs(pivot) > np.sqrt(few) * largest
+
+
+@compiled
+def factor(a: Array, lu: Array, order: Order, eps: float = 2.3e-16) -> bool:
     """LU with partial pivoting: row ``order[i]`` of ``a`` (n, n) is row i of L U, both in ``lu``. True: a is singular.
 
-    A pivot is judged against the largest entry of its own column, so that units do not make a matrix singular.
+    A pivot is judged against the largest entry of its own column, so that units do not make a matrix singular; ``eps``
+    is the rounding unit of its numbers. Two pivots at a time: what is below them is then passed over half as often.
     """
     n = a.shape[0]
-    lu[:, :] = a
+    square = 0.0
     for i in range(n):
         order[i] = i
+        for j in range(n):
+            lu[i, j] = a[i, j]
+            square += a[i, j] * a[i, j]
+    few = (4.0 * n * eps) ** 2
     singular = False
-    for k in range(n):
-        column = 0.0
-        for i in range(n):
-            column = max(column, abs(a[i, k]))
+    for k in range(0, n, 2):
         best = k
         for i in range(k + 1, n):
             if abs(lu[i, k]) > abs(lu[best, k]):
@@ -141,40 +216,88 @@ def factor(a: Array, lu: Array, order: Order) -> bool:
             order[k], order[best] = order[best], order[k]
             for j in range(n):
                 lu[k, j], lu[best, j] = lu[best, j], lu[k, j]
-        if not abs(lu[k, k]) > 4.0 * n * 2.2e-16 * column:
+        if not lu[k, k] * lu[k, k] > few * square and faint(a, k, lu[k, k], few):
             singular = True
             if not abs(lu[k, k]) > 0.0:
                 return True
+        if k + 1 == n:
+            break
+        inverse, ahead = 1.0 / lu[k, k], lu[k, k + 1]
+        best = k + 1
         for i in range(k + 1, n):
-            if lu[i, k] != 0.0:
-                t = lu[i, k] / lu[k, k]
-                lu[i, k] = t
-                for j in range(k + 1, n):
-                    lu[i, j] -= t * lu[k, j]
+            t = lu[i, k] * inverse
+            lu[i, k] = t
+            lu[i, k + 1] -= t * ahead
+            if abs(lu[i, k + 1]) > abs(lu[best, k + 1]):
+                best = i
+        if best != k + 1:
+            order[k + 1], order[best] = order[best], order[k + 1]
+            for j in range(n):
+                lu[k + 1, j], lu[best, j] = lu[best, j], lu[k + 1, j]
+        if not lu[k + 1, k + 1] * lu[k + 1, k + 1] > few * square and faint(a, k + 1, lu[k + 1, k + 1], few):
+            singular = True
+            if not abs(lu[k + 1, k + 1]) > 0.0:
+                return True
+        first, second = lu[k, k + 2 :], lu[k + 1, k + 2 :]
+        t = lu[k + 1, k]
+        for j in range(first.size):
+            second[j] -= t * first[j]
+        inverse = 1.0 / lu[k + 1, k + 1]
+        for i in range(k + 2, n):
+            t = lu[i, k]
+            s = lu[i, k + 1] * inverse
+            lu[i, k + 1] = s
+            below = lu[i, k + 2 :]
+            for j in range(first.size):
+                below[j] -= t * first[j] + s * second[j]
     return singular
 
 
 @compiled
 def solve(lu: Array, order: Order, b: Array, x: Array) -> None:
-    """Fill ``x`` (n, k) with A^{-1} b from the factors of A; all columns advance together, row by row."""
+    """Fill ``x`` (n, k) with A^{-1} b from the factors of A; all columns advance together, two rows at a time."""
     n, count = x.shape
     for i in range(n):
+        own, given = x[i], b[order[i]]
         for k in range(count):
-            x[i, k] = b[order[i], k]
-        for j in range(i):
-            t = lu[i, j]
-            if t != 0.0:
-                for k in range(count):
-                    x[i, k] -= t * x[j, k]
+            own[k] = given[k]
+        for j in range(0, i - 1, 2):
+            t, s, first, second = lu[i, j], lu[i, j + 1], x[j], x[j + 1]
+            for k in range(count):
+                own[k] -= t * first[k] + s * second[k]
+        if i % 2 == 1:
+            t, first = lu[i, i - 1], x[i - 1]
+            for k in range(count):
+                own[k] -= t * first[k]
     for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            t = lu[i, j]
-            if t != 0.0:
-                for k in range(count):
-                    x[i, k] -= t * x[j, k]
+        own = x[i]
+        for j in range(i + 1, n - 1, 2):
+            t, s, first, second = lu[i, j], lu[i, j + 1], x[j], x[j + 1]
+            for k in range(count):
+                own[k] -= t * first[k] + s * second[k]
+        if (n - i) % 2 == 0:
+            t, first = lu[i, n - 1], x[n - 1]
+            for k in range(count):
+                own[k] -= t * first[k]
         t = 1.0 / lu[i, i]
         for k in range(count):
-            x[i, k] *= t
+            own[k] *= t
+
+
+@compiled
+def solve_vector(lu: Array, order: Order, b: Array, x: Array) -> None:
+    """Fill ``x`` (n,) with A^{-1} b from the factors of A."""
+    n = x.size
+    for i in range(n):
+        t, row, known = b[order[i]], lu[i, :i], x[:i]
+        for j in range(i):
+            t -= row[j] * known[j]
+        x[i] = t
+    for i in range(n - 1, -1, -1):
+        t, row, known = x[i], lu[i, i + 1 :], x[i + 1 :]
+        for j in range(known.size):
+            t -= row[j] * known[j]
+        x[i] = t / lu[i, i]
 
 
 @compiled
@@ -183,11 +306,13 @@ def solve_transposed(lu: Array, order: Order, b: Array, x: Array) -> None:
     n = b.size
     for i in range(n):
         b[i] /= lu[i, i]
-        for j in range(i + 1, n):
-            b[j] -= lu[i, j] * b[i]
+        t, row, rest = b[i], lu[i, i + 1 :], b[i + 1 :]
+        for j in range(rest.size):
+            rest[j] -= t * row[j]
     for i in range(n - 1, -1, -1):
+        t, row, rest = b[i], lu[i, :i], b[:i]
         for j in range(i):
-            b[j] -= lu[i, j] * b[i]
+            rest[j] -= t * row[j]
         x[order[i]] = b[i]
 
 

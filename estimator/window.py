@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimator.model import LinearModel
 from estimator.ud import Array
 
 REASONS = {1: "condition", 2: "length", 3: "start"}
@@ -36,6 +37,11 @@ class Rule:
     steps: int = 100
     kappa: float = 1e4
     scale: Array | None = None
+
+    @classmethod
+    def of(cls, model: LinearModel, steps: int = 100) -> Rule:
+        """The rule for a model: kappa is 1e4 in float64 and 1e2 in float32, where it costs the same digits of sigma."""
+        return cls(steps, 1e4 if model.dtype == np.float64 else 1e2)
 
     def __post_init__(self) -> None:
         if self.steps < 1:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from estimator import LinearModel, Smoothed, smooth
-from tests.estimator.oracle import batch, in_sigmas, problem, relative
+from estimator.linear import RESULTS
+from tests.estimator.oracle import Problem, batch, in_sigmas, problem, relative
 
 N, P, M = 4, 2, 3
 GOOD = {"phi": np.eye(N), "gamma": np.ones((N, P)), "q": np.ones(P), "h": np.ones((M, N)), "r": np.ones(M)}
@@ -101,8 +102,9 @@ def test_constant_matrices_are_the_same_as_repeated_ones(method):
     z, prior = rng.normal(size=(10, 3)), {"x0": np.zeros(4), "p0": np.eye(4), "method": method}
     constant = smooth(LinearModel(phi, gamma, q, h, r), z, **prior)
     repeated = smooth(LinearModel(*(np.repeat(a[None], 10, axis=0) for a in (phi, gamma, q, h, r))), z, **prior)
-    for a, b in zip(constant, repeated, strict=True):
-        assert np.array_equal(a, b, equal_nan=True)
+    for name in set(constant._fields) - {"bytes_per_step"}:  # constant matrices are looked up, not kept
+        assert np.array_equal(getattr(constant, name), getattr(repeated, name), equal_nan=True)
+    assert constant.bytes_per_step <= repeated.bytes_per_step
 
 
 def test_the_fields_of_smoothed():
@@ -140,7 +142,7 @@ def test_no_steps_give_the_prior():
 
 
 def test_an_unknown_method_is_refused_by_name():
-    with pytest.raises(ValueError, match="method 'magic' is unknown: choose from ms, rts"):
+    with pytest.raises(ValueError, match="method 'magic' is unknown: choose from ms, rts, joseph, bierman, watanabe"):
         smooth(model(), np.ones((2, M)), method="magic")
 
 
@@ -148,5 +150,124 @@ def test_a_singular_phi_is_refused_by_the_method_that_inverts_it():
     phi = np.repeat(np.eye(N)[None], 6, axis=0)
     phi[4, 3, 3] = 0.0
     singular, prior = model(phi=phi), {"x0": np.zeros(N), "p0": np.eye(N)}
-    with pytest.raises(ValueError, match=r"phi is singular at step 4: .* method 'rts' does not"):
+    with pytest.raises(ValueError, match=r"phi is singular at step 4: .* methods 'rts' and 'watanabe' do not"):
         smooth(singular, np.ones((6, M)), **prior)
+
+
+@pytest.mark.parametrize("wanted", [(), ("std",), ("covariance",), ("cross",), ("filtered",), "std", RESULTS])
+def test_what_is_not_asked_for_is_empty_and_what_is_asked_for_does_not_depend_on_the_rest(wanted):
+    case = problem(4, 5, 2, 2, 30, missing=0.2)
+    everything = smooth(case.model, case.z, **case.prior, window=7, want=RESULTS)
+    part = smooth(case.model, case.z, **case.prior, window=7, want=wanted)
+    for name in ("mean", "std", "covariance", "cross", "filtered_mean", "filtered_std"):
+        asked = name == "mean" or name.removesuffix("_mean").removesuffix("_std") in (
+            [wanted] if wanted == "std" else wanted
+        )
+        if asked:
+            assert np.array_equal(getattr(part, name), getattr(everything, name), equal_nan=True)
+        else:
+            assert len(getattr(part, name)) == 0
+
+
+def test_a_result_that_does_not_exist_is_refused_by_name():
+    with pytest.raises(ValueError, match="want names 'variance': choose from mean, std, covariance, cross, filtered"):
+        smooth(model(), np.ones((2, M)), want=("variance",))
+
+
+def doubled(case):
+    """The same record with the epoch before in the state: its covariance holds that of neighbours."""
+    steps, n, p = case.gamma.shape
+    phi, gamma, h = np.zeros((steps, 2 * n, 2 * n)), np.zeros((steps, 2 * n, p)), np.zeros((*case.h.shape[:2], 2 * n))
+    phi[:, :n, :n], phi[:, n:, :n], gamma[:, :n], h[:, :, :n] = case.phi, np.eye(n), case.gamma, case.h
+    p0 = np.eye(2 * n)
+    p0[:n, :n] = case.p0
+    return Problem(phi, gamma, case.q, h, case.r, case.z, np.concatenate([case.x0, np.zeros(n)]), p0)
+
+
+@pytest.mark.parametrize("window", [1, 6, None])
+def test_covariances_of_neighbours_are_those_of_batch_least_squares(window):
+    case = problem(5, 4, 2, 2, 18, missing=0.2, quiet=0.3)
+    _, covariance = batch(doubled(case))
+    smoothed = smooth(case.model, case.z, **case.prior, window=window, want="cross")
+    std = np.sqrt(np.einsum("jii->ji", covariance[:, :4, :4]))
+    error = np.abs(smoothed.cross - covariance[1:, 4:, :4]) / (std[:-1, :, None] * std[1:, None, :])
+    assert error.max() < 1e-11
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("window", [7, None])
+def test_records_of_one_model_are_what_each_is_alone(threads, window):
+    rng = np.random.default_rng(6)
+    phi, gamma, h = np.linalg.qr(rng.normal(size=(5, 5)))[0], rng.normal(size=(5, 2)), rng.normal(size=(3, 5))
+    system = LinearModel(phi, gamma, np.ones(2), h, np.eye(3) + 0.3)
+    z, x0, p0 = rng.normal(size=(20, 40, 3)), rng.normal(size=(20, 5)), np.ones(5)
+    z[17:, 4, 1], z[19, 7] = np.nan, np.nan  # three patterns of missing samples
+    for prior in ({"x0": x0, "p0": p0}, {}):
+        together = smooth(system, z, **prior, window=window, want=RESULTS, threads=threads)
+        for k in (0, 11, 16, 17, 19):
+            own = {} if not prior else {"x0": x0[k], "p0": p0}
+            alone = smooth(system, z[k], **own, window=window, want=RESULTS)
+            assert in_sigmas(together.mean[k], alone.mean, alone.std) < 1e-10
+            assert np.allclose(together.filtered_mean[k], alone.filtered_mean, rtol=1e-9, atol=1e-9, equal_nan=True)
+            for name in ("std", "covariance", "cross", "filtered_std"):
+                assert np.allclose(getattr(together, name)[k], getattr(alone, name), rtol=1e-12, atol=1e-12)
+
+
+def test_records_that_share_their_factors_share_the_memory_of_a_covariance():
+    together = smooth(model(), np.ones((9, 12, M)), x0=np.zeros(N), p0=np.ones(N))
+    assert together.covariance.shape == (9, 13, N, N) and together.covariance.strides[0] == 0
+    assert together.mean.shape == (9, 13, N) and together.filtered_mean.shape == (9, 13, N)
+
+
+def test_rivals_take_many_records_too():
+    z, prior = np.random.default_rng(7).normal(size=(3, 12, M)), {"x0": np.zeros(N), "p0": np.ones(N), "method": "rts"}
+    together = smooth(model(), z, **prior, threads=2)
+    for k in range(3):
+        alone = smooth(model(), z[k], **prior)
+        assert np.array_equal(together.mean[k], alone.mean) and np.array_equal(together.covariance[k], alone.covariance)
+
+
+def test_float32_is_float64_to_its_own_digits():
+    for seed in range(3):
+        case = problem(seed, 6, 2, 2, 300, missing=0.2)
+        parts = case.phi, case.gamma, case.q, case.h, case.r
+        single = smooth(LinearModel(*parts, dtype=np.float32), case.z, **case.prior, want=RESULTS)
+        double = smooth(case.model, case.z, **case.prior)
+        assert {getattr(single, name).dtype for name in ("mean", "std", "covariance", "filtered_std")} == {
+            np.dtype("f4")
+        }
+        assert in_sigmas(single.mean, double.mean, double.std) < 1e-3 and relative(single.std, double.std) < 1e-4
+        assert (single.std > 0.0).all() and np.array_equal(single.covariance, single.covariance.transpose(0, 2, 1))
+
+
+def test_a_number_type_that_is_neither_is_refused():
+    with pytest.raises(ValueError, match="dtype is int64: float64 or float32 is needed"):
+        model(dtype=np.int64)
+
+
+def test_results_on_disk_are_those_in_memory(tmp_path):
+    case = problem(8, 4, 2, 2, 100, missing=0.1)
+    inside = smooth(case.model, case.z, **case.prior, window=9, want=RESULTS)
+    outside = smooth(case.model, case.z, **case.prior, window=9, want=RESULTS, spill=tmp_path)
+    for name in inside._fields:
+        assert np.array_equal(getattr(inside, name), getattr(outside, name), equal_nan=True)
+    assert isinstance(outside.covariance, np.memmap) and (tmp_path / "covariance.npy").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spill": "x", "method": "rts"}, "method 'rts' keeps everything in memory; spill is for method 'ms'"),
+        ({"threads": 0}, "threads is 0: at least 1 is needed"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        smooth(model(), np.ones((3, M)), **options)
+
+
+def test_records_that_do_not_fit_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"spill is for one record, z of shape \(N, m\)"):
+        smooth(model(), np.ones((2, 3, M)), spill=tmp_path)
+    with pytest.raises(ValueError, match="z has no records"):
+        smooth(model(), np.ones((0, 3, M)))

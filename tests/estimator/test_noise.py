@@ -27,8 +27,8 @@ def test_whitening_keeps_the_information_of_what_is_present(seed, m, constant):
     root = rng.normal(size=(1 if constant else steps, m, m)) + 2.0 * np.eye(m)
     r, h, z = root @ root.transpose(0, 2, 1), rng.normal(size=(1, m, n)), rng.normal(size=(steps, m))
     z[rng.random((steps, m)) < 0.4] = np.nan
-    out_h, out_r, out_z = np.empty((steps, m, n)), np.empty((steps, m)), np.empty((steps, m))
-    noise.whiten(r, h, z, out_h, out_r, out_z)
+    out_h, out_r, out_z = np.empty((steps, m, n)), np.empty((steps, m)), z.copy()
+    noise.whiten(r, h, z, out_h, out_r, out_z[None])
     assert np.array_equal(np.isnan(out_z), np.isnan(z))
     for j in range(steps):
         there = ~np.isnan(z[j])

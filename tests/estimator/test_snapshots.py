@@ -5,10 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimator import Rule, Store
+from estimator import LinearModel, Rule, Store
 from estimator.information import anchor, filter, start
 from estimator.smoother import backward
 from tests.estimator.oracle import problem
+
+
+def sides(store, carry, **options):
+    smoothed = backward(store, carry, **options)
+    return smoothed.mean, smoothed.covariance
 
 
 def filled(steps=40, seed=1, length=7):
@@ -52,8 +57,8 @@ def test_dropping_never_changes_what_is_left(parts):
         store.drop(int(share * len(store)))
         gone = store.dropped
         assert gone + len(store) == at
-        mean, covariance = backward(store, carry)
-        full_mean, full_covariance = backward(all_kept, carry, first=gone)
+        mean, covariance = sides(store, carry)
+        full_mean, full_covariance = sides(all_kept, carry, first=gone)
         assert np.array_equal(mean, full_mean) and np.array_equal(covariance, full_covariance)
         assert store.anchors == [i - gone for i in all_kept.anchors if i >= gone]
 
@@ -91,7 +96,42 @@ def test_steps_that_do_not_follow_are_refused():
     with pytest.raises(ValueError, match="carry is not the one that the newest step"):
         filter(case.model, other, case.z, store=store)
     wide = problem(1, 4, 3, 2, 5)
-    with pytest.raises(ValueError, match="store holds 4 states and 2 noise components, the model has 4 and 3"):
+    with pytest.raises(ValueError, match="store holds 4 states and 2 noise components, the model has 4 states and 3"):
         filter(wide.model, carry, wide.z, store=store)
     with pytest.raises(IndexError, match="the store holds 40 steps"):
         store.drop(41)
+
+
+def test_a_store_on_disk_is_a_store_in_memory(tmp_path):
+    case = problem(6, 4, 2, 2, 100, missing=0.2)
+    inside, outside, carry = Store(), Store(tmp_path / "steps", spill=16), start(4, **case.prior)
+    for a in range(0, 100, 5):
+        chunk, z = case.model.cut(a, a + 5), case.z[a : a + 5]
+        filter(chunk, carry, z, rule=Rule(steps=9), store=inside)
+        carry, _ = filter(chunk, carry, z, rule=Rule(steps=9), store=outside)
+    assert len(list((tmp_path / "steps").glob("*.b.npy"))) == 4
+    for first in (0, 3, 20, 41, 99, 100):
+        a, b = backward(inside, carry, first=first, cross=True), backward(outside, carry, first=first, cross=True)
+        assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+    assert all(np.array_equal(x, y) for x, y in zip(inside.steps, outside.steps, strict=True))
+    outside.drop(45)
+    assert len(list((tmp_path / "steps").glob("*.b.npy"))) == 2
+    assert np.array_equal(sides(outside, carry)[0], sides(inside, carry, first=45)[0])
+
+
+def test_steps_of_a_constant_model_are_looked_up_and_not_kept():
+    case = problem(7, 4, 2, 2, 1)
+    z = np.random.default_rng(0).normal(size=(70, 2))
+    constant = LinearModel(case.phi[0], case.gamma[0], case.q[0], case.h[0], case.r[0])
+    varying = LinearModel(*(np.repeat(a, 70, axis=0) for a in (case.phi, case.gamma, case.q, case.h, case.r)))
+    table, rows, carry = Store(), Store(), start(4, **case.prior)
+    end = carry
+    for a in range(0, 70, 10):
+        end, _ = filter(constant, end, z[a : a + 10], rule=Rule(steps=8), store=table)
+    filter(varying, carry, z, rule=Rule(steps=8), store=rows)
+    assert table.bytes_per_step == 8 * (4 * 2 + 2 * 2 + 1) < rows.bytes_per_step == 8 * (16 + 2 * 8 + 2 * 2)
+    assert all(np.array_equal(a, b) for a, b in zip(table.steps, rows.steps, strict=True))
+    for first in (0, 5, 33, 70):
+        assert np.array_equal(sides(table, end, first=first)[1], sides(rows, end, first=first)[1])
+    end, _ = filter(problem(8).model, end, problem(8).z, rule=Rule(steps=8), store=table)  # then another model
+    assert len(table) == 90 and backward(table, end).mean.shape == (91, 4)

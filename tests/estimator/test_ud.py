@@ -47,12 +47,39 @@ def test_agee_turner_adds_a_square(seed, n, c, empty):
     ut, d = factors(rng, n)
     if empty:
         d[rng.random(n) < 0.5] = 0.0
-    before, a, first = dense(ut, d), rng.normal(size=n), d[0]
-    added = ud.agee_turner(ut, d, a.copy(), c)
+    before, a = dense(ut, d), rng.normal(size=n)
+    ud.agee_turner(ut, d, a.copy(), c)
     expected = before + c * np.outer(a, a)
     assert np.allclose(dense(ut, d), expected, atol=1e-12 * np.abs(expected).max())
     assert is_unit_triangular(ut) and (d >= 0.0).all()
-    assert d[0] == first + added
+
+
+@given(seeds, sizes, st.integers(1, 3))
+@settings(max_examples=40, deadline=None)
+def test_data_in_front_are_whatever_the_whole_matrix_would_hold(seed, n, records):
+    # L_aug = [[rho, (L x)^T], [L x, L]] for each record: the columns in front are row 0 of its factor.
+    rng = np.random.default_rng(seed)
+    ut, d = factors(rng, n)
+    eta, e, r, row, c = rng.normal(size=(n, records)), rng.normal(size=n), 0.7, rng.normal(size=records + n), 1.3
+    with_data = np.ascontiguousarray(np.concatenate([eta, ut], axis=1))
+    pivots, k = d.copy(), np.empty(records + n)
+    s = ud.bierman(with_data, pivots, e, r, k)
+    residual = row.copy()
+    left = ud.agee_turner(with_data, pivots, residual, c)
+    for t in range(records):
+        alone = np.block([[np.ones((1, 1)), np.zeros((1, n))], [eta[:, t : t + 1], ut]])
+        whole = dense(alone, np.concatenate([[0.0], d]))
+        padded = np.concatenate([[0.0], e])
+        assert np.isclose(k[t], (whole @ padded)[0], atol=1e-10)
+        whole -= np.outer(whole @ padded, whole @ padded) / s
+        a = np.concatenate([row[t : t + 1], row[records:]])
+        whole += c * np.outer(a, a)
+        kept = dense(np.block([[np.ones((1, 1)), np.zeros((1, n))], [with_data[:, t : t + 1], with_data[:, records:]]]),
+                     np.concatenate([[0.0], pivots]))  # fmt: skip
+        scale = np.abs(whole).max()
+        assert np.allclose(kept[1:], whole[1:], atol=1e-9 * scale)
+        told = whole[0, 0] - kept[0, 0]  # c (z - M x)^2 / (1 + ..) less what the downdate took from rho
+        assert np.isclose(told + k[t] ** 2 / s, left * residual[t] ** 2 + k[t] ** 2 / s, atol=1e-9 * scale)
 
 
 def test_agee_turner_keeps_the_small_pivot_under_a_dominating_datum():
@@ -64,9 +91,9 @@ def test_agee_turner_keeps_the_small_pivot_under_a_dominating_datum():
     expected = (exact_d[1] * exact_u[0] + Fraction(c) * s * Fraction(a[0])) / dn
     rest = Fraction(c) * exact_d[1] / dn * (Fraction(a[0]) - s * exact_u[0]) ** 2
     ut, pivots = np.array([[1.0, 0.0], [u, 1.0]]), np.array(d)
-    added = ud.agee_turner(ut, pivots, np.array(a), c)
+    ud.agee_turner(ut, pivots, np.array(a), c)
     assert ut[1, 0] == pytest.approx(float(expected), rel=1e-15)
-    assert added == pytest.approx(float(rest), rel=1e-14)
+    assert pivots[0] == pytest.approx(1.0 + float(rest), rel=1e-15)
 
 
 def test_information_from_nothing_is_exact():
