@@ -126,12 +126,15 @@ def move(
     """
     n, p = since.shape[0], gamma.shape[2]
     lu, order = np.empty((n, n), phi.dtype), np.empty(n, np.int64)
-    e, v = np.empty((n, p), phi.dtype), np.empty((4, n), phi.dtype)
+    full = (p + 7) // 8 * 8  # columns, the last of them zero: whole registers instead of single numbers left over
+    g, e, v = np.zeros((n, full), phi.dtype), np.empty((n, full), phi.dtype), np.empty((4, n), phi.dtype)
+    unit = np.eye(n).astype(phi.dtype)
+    before = since
     for i in range(closed.size):
         now, end = phi[min(i, phi.shape[0] - 1)], ends[i]
         closed[i] = 0
         if steps > 0:
-            np.dot(now, since, end)
+            np.dot(now, before, end)
             stiff = factor(end, lu, order, eps)
             if not stiff and (suspect(end, lu, order, scale, limit) or (steps + 1) % CHECK == 0):
                 stiff = not condition(end, lu, order, scale, v) <= limit
@@ -139,23 +142,29 @@ def move(
                 closed[i] = CONDITION
                 steps = 0
         if steps == 0:
-            end[:, :] = now
+            for row in range(n):
+                for j in range(n):
+                    end[row, j] = now[row, j]
             if factor(end, lu, order, eps):
                 return steps, i
-        solve(lu, order, gamma[min(i, gamma.shape[0] - 1)], e)
-        own = es[i]
-        for c in range(p):
-            for j in range(n):
-                own[c, j] = e[j, c]
+        noise = gamma[min(i, gamma.shape[0] - 1)]
+        for j in range(n):
+            for c in range(p):
+                g[j, c] = noise[j, c]
+        solve(lu, order, g, e)
+        for j in range(n):
+            for c in range(p):
+                es[i, c, j] = e[j, c]
         steps += 1
         if steps >= longest:
             closed[i] |= LENGTH
             steps = 0
-            since[:, :] = 0.0
-            for j in range(n):
-                since[j, j] = 1.0
+            before = unit
         else:
-            since[:, :] = end
+            before = end
+    for row in range(n):
+        for j in range(n):
+            since[row, j] = before[row, j]
     return steps, -1
 
 

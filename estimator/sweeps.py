@@ -125,9 +125,8 @@ def anchor(ut: Array, d: Array, phi: Array, regular: bool, eps: float) -> None:
     """Move the anchor to the present epoch: overwrite ``ut`` (n, K + n) and ``d``; ``phi`` (n, n) = phi_{j,0}.
 
     V = diag(I, phi^{-T}) [eta^T; U], then mwgs; states and their covariance do not change. The eta that comes out is
-    exact but amplifies rounding, so it is formed again from the state. Not while some direction is unknown (``regular``
-    is false): pivots of rounding size stand for it then, and the state is nonsense along it; nor when the two disagree
-    by more than a thousandth of a sigma.
+    exact but amplifies rounding, so it is formed again from the state; but not while some direction is unknown
+    (``regular`` is false): pivots of rounding size stand for it then, and the state is nonsense along it.
     """
     n = phi.shape[0]
     data = ut.shape[1] - n
@@ -136,9 +135,7 @@ def anchor(ut: Array, d: Array, phi: Array, regular: bool, eps: float) -> None:
     x, moved = np.empty((n, data), phi.dtype), np.empty((n, data), phi.dtype)
     b, column = np.empty(n, phi.dtype), np.empty(n, phi.dtype)
     factor(phi, lu, order, eps)
-    informed = regular
     for j in range(n):
-        informed = informed and d[j] > 0.0
         weight[j] = d[j]
         for t in range(data):
             v[t, j] = ut[j, t]
@@ -150,17 +147,13 @@ def anchor(ut: Array, d: Array, phi: Array, regular: bool, eps: float) -> None:
     state(ut, x)
     np.dot(phi, x, moved)
     mwgs(v, weight, ut, d)
-    for j in range(n):
-        for t in range(data):
-            eta = moved[j, t]
-            for i in range(j):
-                eta += ut[j, data + i] * moved[i, t]
-            x[j, t] = eta
-            informed = informed and abs(eta - ut[j, t]) * np.sqrt(d[j]) < 1e-3
-    if informed:
+    if regular:
         for j in range(n):
             for t in range(data):
-                ut[j, t] = x[j, t]
+                eta = moved[j, t]
+                for i in range(j):
+                    eta += ut[j, data + i] * moved[i, t]
+                ut[j, t] = eta
 
 
 @compiled

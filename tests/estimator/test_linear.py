@@ -5,6 +5,7 @@ import pytest
 
 from estimator import LinearModel, Smoothed, smooth
 from estimator.linear import RESULTS
+from sims.experiments.records import STRESS, dying
 from tests.estimator.oracle import Problem, batch, in_sigmas, problem, relative
 
 N, P, M = 4, 2, 3
@@ -271,3 +272,12 @@ def test_records_that_do_not_fit_are_refused(tmp_path):
         smooth(model(), np.ones((2, 3, M)), spill=tmp_path)
     with pytest.raises(ValueError, match="z has no records"):
         smooth(model(), np.ones((0, 3, M)))
+
+
+def test_digits_lost_on_the_way_back_are_reported_and_not_returned():
+    lost = dying()
+    with pytest.raises(ValueError, match=r"digits of epoch \d+ are lost .* method 'watanabe' smooths forward"):
+        smooth(lost.model(np.float64), lost.z, **lost.prior)
+    for make in STRESS:  # hard, and within reach
+        record = make()
+        smooth(record.model(np.float64), record.z, **record.prior)
