@@ -1,0 +1,131 @@
+"""Tables 1 to 5 of Shi's paper: what they say, where they disagree, and what the running code counts beside them."""
+
+import json
+
+import pytest
+from rich.console import Console
+
+import sortie
+from sims.experiments import shi
+from sims.experiments.counting import Operations
+from sims.experiments.operation_counts import Reproduction, case, count, figures, problem, tell
+from sims.experiments.shi import METHODS, SIZES, Size
+
+SMALL = Size(10, 2, 2)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return Reproduction((case(SMALL),))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_rows_of_table_1_add_up_to_table_3(size):
+    rows = sum((shi.evaluated(row, size) for row in shi.TABLE_1.values()), Operations())
+    assert rows == shi.evaluated(shi.TABLE_3["MS"], size)
+
+
+def test_table_4_is_tables_2_and_3_but_for_its_slips():
+    slips = {
+        (size, method): (slip.additions, slip.multiplications, slip.divisions)
+        for size in SIZES
+        for method in METHODS
+        if (slip := shi.slip(method, size)) != Operations()
+    }
+    assert slips == {
+        (Size(10, 2, 2), "FPS"): (0, 269, 0),
+        (Size(10, 2, 2), "SS"): (0, 270, 0),
+        (Size(10, 6, 6), "FPS"): (185, 0, 0),
+        (Size(10, 6, 6), "SS"): (45, 0, 0),
+        (Size(30, 4, 4), "MS"): (-13500, -13488, 0),
+        (Size(30, 15, 15), "MS"): (-13500, -13290, 0),
+        (Size(30, 15, 15), "FPS"): (0, 2925, 0),
+        (Size(30, 30, 30), "MS"): (-13500, -12635, 0),
+    }
+    assert [shi.formulas("MS", size) for size in SIZES[3:]] == [
+        Operations(99428, 102581, 355),
+        Operations(171335, 176930, 1004),
+        Operations(293375, 301910, 1889),
+    ]
+
+
+def test_a_formula_that_gives_no_whole_number_is_named():
+    with pytest.raises(ValueError, match=r"no whole number of operations at \(3, 1, 1\)"):
+        shi.evaluated(lambda n, p, m: (n / 2, p, m), Size(3, 1, 1))
+
+
+def test_the_record_is_dense_and_in_its_steady_state():
+    given = problem(SMALL, 2)
+    assert all((array != 0.0).all() for array in given.model.values())
+    assert (given.p0 != 0.0).all() and (given.z != 0.0).all() and (given.x0 != 0.0).all()
+
+
+def test_the_paper_s_ratios(small):
+    ratios = {rival: small.cases[0].ratios(rival) for rival in ("FPS", "SS")}
+    assert [round(ratios[rival]["Table 4"], 2) for rival in ratios] == [1.72, 1.77]
+    assert [round(ratios[rival]["formulas"], 2) for rival in ratios] == [1.69, 1.74]
+
+
+def test_the_targets_are_met_at_the_smallest_size(small):
+    assert [target.met for target in small.targets] == [True, True, True]
+    assert small.cases[0].share(small.cases[0].ours) < 0.9
+
+
+def test_a_rank_one_step_makes_the_rivals_cheaper(small):
+    one = small.cases[0]
+    for rival in ("FPS", "SS"):
+        assert one.rank_one[rival].filter == one.per_component[rival].filter
+        assert one.rank_one[rival].smoother.total < one.per_component[rival].smoother.total
+
+
+def test_a_rank_one_step_takes_away_the_gain_where_there_is_as_much_noise_as_state():
+    size = Size(10, 10, 10)
+    ours = count("MS", size).both.total
+    assert count("FPS", size, per_component_mwgs=True).both.total > 1.7 * ours
+    assert count("FPS", size, per_component_mwgs=False).both.total < ours
+
+
+def test_the_parts_of_the_filter_are_the_filter(small):
+    ours = small.cases[0].ours
+    assert sum(ours.parts.values(), Operations()) == ours.filter
+    assert ours.parts["phi_j+1,0: product"] == small.cases[0].table_1["phi_j+1,0"]
+    assert ours.parts["M: product"] == small.cases[0].table_1["M_j+1"]
+    assert ours.parts["E: solves"] == small.cases[0].table_1["E_j"] + Operations(divisions=SMALL.n)
+    assert ours.parts["the rest"].total < 0.02 * ours.filter.total
+    assert 0 < ours.rule.total < 0.03 * ours.filter.total
+
+
+def test_storage_is_that_of_table_5(small):
+    one = small.cases[0]
+    n, p, _ = SMALL
+    assert one.table_5 == {"MS": 152, "FPS": 146, "SS": 154}
+    assert (one.ours.kept, one.ours.read) == (n * n + 2 * n * p + 2 * p, 0)
+    for rival in ("FPS", "SS"):
+        assert one.rank_one[rival].kept + one.rank_one[rival].read == one.table_5[rival]
+
+
+def test_a_setting_that_no_kernel_knows_is_refused():
+    with pytest.raises(RuntimeError, match="no kernel of ms has an argument per_component_mwgs"):
+        count("MS", SMALL, per_component_mwgs=True)
+
+
+def test_everything_can_be_printed_and_written(small, capsys):
+    console = Console(width=120, record=True, highlight=False)
+    tell(small, console)
+    told = console.export_text()
+    assert max(len(line) for line in told.splitlines()) <= 120 and "…" not in told
+    for words in ("Table 1", "Table 2", "Table 3", "Table 4", "Table 5", "+269", "+270", "the same as all of Table 1"):
+        assert words in told
+    assert told.count("met: counted") == 3 and "rank-one" in told and "reconstructed" in told
+    found = json.loads(json.dumps(figures(small)))
+    assert found["cases"][0]["size"] == {"n": 10, "p": 2, "m": 2}
+    assert found["cases"][0]["slips"]["SS"]["multiplications"] == 270
+    assert [target["met"] for target in found["targets"]] == [True] * 3
+
+
+def test_the_command_prints_json(small, monkeypatch, capsys):
+    monkeypatch.setattr("sims.experiments.operation_counts.tables", lambda told: small)
+    sortie.reproduce_shi(json=True)
+    assert json.loads(capsys.readouterr().out)["caveats"] == list(small.caveats)
+    sortie.reproduce_shi()
+    assert "Table 5" in capsys.readouterr().out
