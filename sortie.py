@@ -454,8 +454,59 @@ def bench_smooth(log: Path | None = None) -> None:
     print(f"  {'all':9} {total:7.3f} s  100.0 %  {frames / total / 1e3:8.0f} k frames/s")
 
 
+def reproduce_shi(*, json: bool = False) -> None:
+    """Tables 1 to 5 of Shi's paper of 1991, beside the operations that the running code counts.
+
+    Takes a minute: every operation of the smoother and of its rivals is done by numbers that count.
+
+    Parameters
+    ----------
+    json
+        Print JSON instead of tables.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from sims.experiments.operation_counts import figures, tables, tell
+
+    found = tables(told=lambda size: say(f"counting a step of n = {size.n}, p = {size.p}, m = {size.m}"))
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(figures(found))).decode())
+    else:
+        tell(found, Console(highlight=False, width=max(Console().width, 120)))  # a narrower one would cut digits
+
+
+def bench_linear(*, quick: bool = False, json: bool = False) -> None:
+    """Our linear filters and smoothers beside those of other libraries: time per step, and what hard records leave.
+
+    The other libraries come with the extra `peers`; those that are not installed are rows that say so.
+
+    Parameters
+    ----------
+    quick
+        Fewer sizes, fewer steps, fewer rounds.
+    json
+        Print JSON instead of tables.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from sims.experiments.peers import FULL, QUICK, compare
+
+    found = compare(QUICK if quick else FULL, tell=say)
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+        return
+    console = Console(highlight=False, width=max(Console().width, 140))
+    for what, value in found.machine.items():
+        console.print(f"{what}: {value}", markup=False)
+    for table in found.tables():
+        console.print(table)
+
+
 COMMANDS: tuple[Callable[..., None], ...] = (demo, live, smooth, review, verify, replay, sim, ingest, estimate, record)
-BENCHMARKS: dict[str, Callable[..., None]] = {"smooth": bench_smooth}
+BENCHMARKS: dict[str, Callable[..., None]] = {"smooth": bench_smooth, "linear": bench_linear}
+REPRODUCTIONS: dict[str, Callable[..., None]] = {"shi": reproduce_shi}
 PURPOSE = "Turn the telemetry of a test flight into a trustworthy flight path while the aircraft still flies."
 
 
@@ -464,6 +515,7 @@ def _overview() -> str:
     lines = ["Usage: sortie COMMAND", "", PURPOSE, "", "Commands:"]
     about = [(command.__name__, inspect.getdoc(command) or "") for command in COMMANDS]
     about += [(f"bench {name}", inspect.getdoc(command) or "") for name, command in BENCHMARKS.items()]
+    about += [(f"reproduce {name}", inspect.getdoc(command) or "") for name, command in REPRODUCTIONS.items()]
     lines += [f"  {name:13} {text.splitlines()[0]}" for name, text in about]
     lines += [
         "",
@@ -483,6 +535,10 @@ def _application() -> Any:
     for name, command in BENCHMARKS.items():
         bench.command(command, name=name)
     app.command(bench)
+    reproduce = App(name="reproduce", help="Find what a paper printed again.", help_format="plaintext")
+    for name, command in REPRODUCTIONS.items():
+        reproduce.command(command, name=name)
+    app.command(reproduce)
     return app
 
 
