@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from estimator.information import Carry, Filtered, InformationFilter
     from estimator.linear import Smoothed, smooth
     from estimator.model import LinearModel
+    from estimator.parallel import Record, smooth_records
     from estimator.smoother import Unobservable
     from estimator.snapshots import Store
     from estimator.window import Rule
@@ -29,11 +30,13 @@ __all__ = [
     "Filtered",
     "InformationFilter",
     "LinearModel",
+    "Record",
     "Rule",
     "Smoothed",
     "Store",
     "Unobservable",
     "smooth",
+    "smooth_records",
 ]
 
 _HOME = {
@@ -41,11 +44,13 @@ _HOME = {
     "Filtered": "information",
     "InformationFilter": "information",
     "LinearModel": "model",
+    "Record": "parallel",
     "Rule": "window",
     "Smoothed": "linear",
     "Store": "snapshots",
     "Unobservable": "smoother",
     "smooth": "linear",
+    "smooth_records": "parallel",
 }
 
 

@@ -16,48 +16,69 @@ from estimator.information import Carry, factors
 from estimator.snapshots import Shape, Store, Stretch
 from estimator.ud import Array
 
+NAMED = 3  # directions in the message of ``Unobservable``
+
 
 class Unobservable(ValueError):
-    """Some direction of the state was seen by no measurement and no prior.
+    """Some directions of the state were seen by no measurement and no prior.
 
     A direction that phi keeps shrinking while process noise feeds it is forgotten in time: over a long record its
     process noise tells its variance, and it does not count as unobservable.
 
     Attributes
     ----------
-    direction : (n,) array
-        Weights of the states in that direction, at the last epoch, largest magnitude 1.
-    count : int
-        Number of such directions; ``direction`` is the one about which least is known.
+    directions : (count, n) array
+        Weights of the states in each direction, largest magnitude 1, at the last epoch (at epoch 0 for method
+        "watanabe"). They span all that is unknown.
     """
 
-    def __init__(self, direction: Array, count: int) -> None:
-        self.direction, self.count = direction, count
-        order = np.argsort(-np.abs(direction), kind="stable")
-        named = [f"{direction[i]:+.3g} x[{i}]" for i in order if abs(direction[i]) >= 1e-3]
-        more = f" (and {count - 1} more)" if count > 1 else ""
-        super().__init__(f"no measurement and no prior tells the direction {' '.join(named)}{more}")
+    def __init__(self, directions: Array) -> None:
+        self.directions = directions / np.take_along_axis(
+            directions, np.argmax(np.abs(directions), axis=1)[:, None], axis=1
+        )
+        told = "; ".join(_named(direction) for direction in self.directions[:NAMED])
+        more = f"; and {self.count - NAMED} more" if self.count > NAMED else ""
+        what = "direction" if self.count == 1 else "directions"
+        super().__init__(f"no measurement and no prior tells the {what} {told}{more}")
+
+    @property
+    def count(self) -> int:
+        """How many directions are unknown."""
+        return int(self.directions.shape[0])
+
+    @property
+    def direction(self) -> Array:
+        """The first of them."""
+        first: Array = self.directions[0]
+        return first
 
 
-def unobserved(carry: Carry) -> tuple[Array, int]:
-    """The least known direction (n,) at the present epoch, and how many directions are not known at all.
+def _named(direction: Array) -> str:
+    order = np.argsort(-np.abs(direction), kind="stable")
+    return " ".join(f"{direction[i]:+.3g} x[{i}]" for i in order if abs(direction[i]) >= 1e-3)
 
-    Singular values of diag(L)^{-1/2} U D^{1/2}, whose rows have length 1 (or 0: a state nobody has seen). An oblique
-    unobserved direction leaves a pivot of rounding size and not a zero, so D alone does not tell.
+
+def unknown_directions(ut: Array, d: Array, faint: float) -> Array:
+    """Directions (k, n) about which an information matrix U D U^T says nothing, or nothing but rounding.
+
+    Singular values of diag(L)^{-1/2} U D^{1/2}, whose rows have length 1 (or 0: states nobody has seen, which are plain
+    axes of the null space). An oblique unobserved direction leaves a pivot of rounding size and not a zero, so D alone
+    does not tell; where it holds a zero, the least known direction is one of them in any case.
     """
-    ut, d, phi = (array.astype(np.float64) for array in factors(carry))
     n = d.size
-    root = ut[:, -n:].T * np.sqrt(d)
+    root = ut.T.astype(np.float64) * np.sqrt(d.astype(np.float64))
     length = np.sqrt((root * root).sum(axis=1))
-    scale = np.where(length > 0.0, length, 1.0)
-    left, values, _ = np.linalg.svd(root / scale[:, None])
-    faint = sweeps.limits(carry.d.dtype)[1]
-    count = int((values <= faint * values[0]).sum()) if values[0] > 0.0 else n
-    direction = left[:, -1] / scale
-    if (length == 0.0).any():  # such states are axes of the null space, and its plainest members
-        direction = (length == 0.0) * (np.cumsum(length == 0.0) == 1) * 1.0
-    direction = phi @ direction
-    return direction / direction[np.argmax(np.abs(direction))], count
+    seen = length > 0.0
+    axes: Array = np.eye(n)[~seen]
+    if not seen.any():
+        return axes
+    left, values, _ = np.linalg.svd(root[seen] / length[seen, None])
+    unknown = int((values <= faint * values[0]).sum())
+    if not unknown and not axes.size and not (d > 0.0).all():
+        unknown = 1
+    oblique = np.zeros((unknown, n))
+    oblique[:, seen] = (left[:, ::-1][:, :unknown] / length[seen, None]).T
+    return np.concatenate([axes, oblique])
 
 
 class Interval(NamedTuple):
@@ -105,9 +126,9 @@ def stretches(
         raise ValueError("carry is not the one that the newest step of this store ended with")
     ut, d, phi = factors(carry)
     if not carry.regular or not (d > 0.0).all():
-        direction, unknown = unobserved(carry)
-        if unknown or not (d > 0.0).all():
-            raise Unobservable(direction, max(unknown, 1))
+        unknown = unknown_directions(ut[:, -n:], d, sweeps.limits(d.dtype)[1])
+        if unknown.size:
+            raise Unobservable(unknown @ phi.T)
     x, vt, weight = np.empty((n, ut.shape[1] - n), d.dtype), np.empty((n, n), d.dtype), np.empty(n, d.dtype)
     sweeps.terminal(ut, d, x, vt, weight)
     shape = store.shape if count else Shape(n, 0, x.shape[1], d.dtype)

@@ -31,7 +31,7 @@ from estimator.linear import Smoothed
 from estimator.model import LinearModel
 from estimator.rivals import conditioning, entry
 from estimator.rivals.conditioning import carried, condition, project, square, variances
-from estimator.smoother import Unobservable
+from estimator.smoother import Unobservable, unknown_directions
 from estimator.ud import Array, agee_turner, bierman, compiled, mwgs
 
 entry.renew(__file__, ud, conditioning)
@@ -240,7 +240,9 @@ def smooth(
     y, info_ut, info_d = np.empty(n, dtype), np.empty((n, n), dtype), np.empty(n, dtype)
     backward(model.phi, model.gamma, model.q, h, r, data, y, info_ut, info_d, b, qs, gs)
     if x0 is None:
-        _observed(info_ut, info_d)
+        unknown = unknown_directions(info_ut, info_d, float(np.sqrt(np.finfo(dtype).eps)))
+        if unknown.size:
+            raise Unobservable(unknown)
         invert(info_ut, info_d, y, x, ut, d)
     else:
         combine(info_ut, info_d, y, x, ut, d)
@@ -253,18 +255,3 @@ def smooth(
     if "std" not in want:
         room = room._replace(variance=room.variance[:0])
     return room.smoothed(n * p + 2 * p)
-
-
-def _observed(ut: Array, d: Array) -> None:
-    """Raise `Unobservable` unless U D U^T has an inverse: singular values of its root, rows scaled to length 1."""
-    root = ut.T.astype(np.float64) * np.sqrt(d.astype(np.float64))
-    length = np.sqrt((root * root).sum(axis=1))
-    scale = np.where(length > 0.0, length, 1.0)
-    left, values, _ = np.linalg.svd(root / scale[:, None])
-    faint = np.sqrt(np.finfo(d.dtype).eps) * values[0]
-    unknown = int((values <= faint).sum())
-    if unknown or not (d > 0.0).all():
-        direction = left[:, -1] / scale
-        if (length == 0.0).any():  # such states are axes of the null space, and its plainest members
-            direction = (length == 0.0) * (np.cumsum(length == 0.0) == 1) * 1.0
-        raise Unobservable(direction / direction[np.argmax(np.abs(direction))], max(unknown, 1))

@@ -11,27 +11,29 @@ from tests.estimator.oracle import batch, in_correlation, in_sigmas, problem, re
 METHODS = ["ms", *rivals.METHODS]
 PRIORLESS = {"ms", "watanabe"}  # the others are told so, and say so
 EPS = np.finfo(float).eps
+BOUND = {"watanabe": 1e-6}  # sigma; it carries the information vector, the others a square root of it or the state
 
 
-@st.composite
-def records(draw):
-    """A random record, by its seed and the sizes of everything."""
-    return problem(
-        draw(st.integers(0, 2**32 - 1)),
-        draw(st.integers(1, 9)),
-        draw(st.integers(1, 4)),
-        draw(st.integers(1, 4)),
-        draw(st.integers(1, 20)),
-        prior=draw(st.booleans()),
-        missing=draw(st.sampled_from([0.0, 0.3, 0.7])),
-        correlated=draw(st.booleans()),
-        quiet=draw(st.sampled_from([0.0, 0.4])),
-    )
+# Drawn as arguments of ``problem``, not as arrays: a failure then prints what one can read and use again.
+records = st.fixed_dictionaries(
+    {
+        "seed": st.integers(0, 2**32 - 1),
+        "n": st.integers(1, 9),
+        "p": st.integers(1, 4),
+        "m": st.integers(1, 4),
+        "steps": st.integers(1, 20),
+        "prior": st.booleans(),
+        "missing": st.sampled_from([0.0, 0.3, 0.7]),
+        "correlated": st.booleans(),
+        "quiet": st.sampled_from([0.0, 0.4]),
+    }
+)
 
 
-@given(records(), st.sampled_from([1, 2, 7, None]), st.sampled_from([1, 2]))
+@given(records, st.sampled_from([1, 2, 7, None]), st.sampled_from([1, 2]))
 @settings(max_examples=80, deadline=None)
-def test_every_method_is_batch_least_squares(case, window, threads):
+def test_every_method_is_batch_least_squares(record, window, threads):
+    case = problem(**record)
     mean = covariance = None
     for method in METHODS if case.x0 is not None else sorted(PRIORLESS):
         try:
@@ -48,15 +50,18 @@ def test_every_method_is_batch_least_squares(case, window, threads):
             std = np.sqrt(np.einsum("jii->ji", covariance))
             # Few measurements can tell a start from nothing badly: then float64 keeps fewer digits.
             slack = 0.0 if case.x0 is not None else 1e-7
-        assert in_sigmas(found.mean, mean, std) < 1e-8 + slack + 1e2 * EPS * np.abs(mean / std).max(), method
+        assert in_sigmas(found.mean, mean, std) < (
+            BOUND.get(method, 1e-8) + slack + 1e2 * EPS * np.abs(mean / std).max()
+        ), method
         assert relative(found.std, std) < 1e-8 + slack, method
         assert in_correlation(found.covariance, covariance) < 1e-8 + slack, method
         assert np.array_equal(found.covariance, found.covariance.transpose(0, 2, 1)), method
 
 
-@given(records(), st.sampled_from([1, 7, None]))
+@given(records, st.sampled_from([1, 7, None]))
 @settings(max_examples=25, deadline=None)
-def test_a_masked_measurement_is_a_removed_one(case, window):
+def test_a_masked_measurement_is_a_removed_one(record, window):
+    case = problem(**record)
     if case.x0 is None or not np.isnan(case.z).any():
         return
     wild = case.h.copy()

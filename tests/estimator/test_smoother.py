@@ -200,11 +200,19 @@ def test_an_oblique_unobserved_direction_is_named(window):
     assert np.allclose(error.direction, [1.0, -0.5, 0.0], atol=1e-6) and error.count == 1
 
 
-def test_several_unobserved_directions_are_counted():
+def test_several_unobserved_directions_are_all_named():
     error = unobservable([[1.0, 1.0, 1.0]])
-    assert error.count == 2 and abs(error.direction.sum()) < 1e-6
-    assert "(and 1 more)" in str(error)
-    assert unobservable([[0.0, 0.0, 0.0]]).count == 3
+    assert error.count == 2 and np.abs(error.directions.sum(axis=1)).max() < 1e-6
+    assert np.linalg.matrix_rank(error.directions) == 2
+    error = unobservable([[0.0, 0.0, 0.0]])
+    assert str(error) == "no measurement and no prior tells the directions +1 x[0]; +1 x[1]; +1 x[2]"
+
+
+def test_axes_and_oblique_directions_are_named_together_and_the_many_are_counted():
+    # x0 + 2 x1 is seen: x2 is an axis of what is not, (2, -1, 0) is not one.
+    error = unobservable([[1.0, 2.0, 0.0]])
+    assert np.allclose(error.directions, [[0.0, 0.0, 1.0], [1.0, -0.5, 0.0]], atol=1e-6)
+    assert str(unobservable(np.eye(6)[:1], n=6)).endswith("+1 x[1]; +1 x[2]; +1 x[3]; and 2 more")
 
 
 def test_the_direction_is_that_of_the_last_epoch():
