@@ -35,6 +35,7 @@ Flags = NDArray[np.uint8]
 CONDITION, LENGTH = 1, 2  # bits of ``closed``: a window ended before this step, after it
 CHECK = 8  # steps between two estimates of the condition number
 BLOCK = 256  # steps that are prepared at once
+TABLES = 8  # of one model, by rule
 LONGEST_TABLE = 1000  # steps; a longer window of a constant model is worked out step by step
 
 
@@ -196,19 +197,23 @@ class Table(NamedTuple):
     why: int
 
 
-def table(model: LinearModel, rule: Rule) -> Table | None:
-    """Return the window of a model with constant phi and gamma; None: they vary, or the window is too long to tabulate.
+def table(model: LinearModel, rule: Rule, count: int) -> Table | None:
+    """Return the window of a model with constant phi and gamma, of which ``count`` more steps are to be taken.
 
-    Raises
-    ------
-    ValueError
-        phi is singular.
+    None: they vary, or phi is singular, or the window is longer than all the steps that have been asked for so far, or
+    too long to tabulate. A step then has to be worked out.
     """
     if model.phi.shape[0] != 1 or model.gamma.shape[0] != 1 or rule.steps > LONGEST_TABLE:
         return None
     scale = rule.scales(model.n)
     key = (rule.steps, rule.kappa, scale.tobytes())
-    if key not in model.tables:
+    found = model.tables.get(key)
+    if found is None:
+        model.taken += count
+        if model.taken < rule.steps:
+            return None
+        if len(model.tables) >= TABLES:
+            model.tables.clear()
         n, p, count = model.n, model.p, rule.steps
         phi, es = np.empty((count + 1, n, n), model.dtype), np.empty((count, p, n), model.dtype)
         closed = np.empty(count, np.uint8)
@@ -225,8 +230,7 @@ def table(model: LinearModel, rule: Rule) -> Table | None:
         plain = model.h.shape[0] == 1 and model.r.ndim == 2
         rows = np.empty((length if plain else 0, model.m, n), model.dtype)
         observe(model.h, phi[1:], rows)
-        model.tables[key] = Table(phi[: length + 1].copy(), es[:length].copy(), rows, why)
-    found = model.tables[key]
+        found = model.tables[key] = Table(phi[: length + 1].copy(), es[:length].copy(), rows, why)
     assert isinstance(found, Table)
     return found
 
@@ -278,6 +282,7 @@ def prepare(
     steps: int,
     count: int,
     kept: tuple[Array, Array] | None,
+    first: int,
 ) -> Iterator[Prepared]:
     """Yield ``count`` steps in blocks.
 
@@ -291,6 +296,8 @@ def prepare(
         phi_{j,0} of the epoch before, and its steps since the anchor.
     kept : (N, n, n) and (N, p, n) arrays, optional
         Where to keep phi_{j+1,0} and E_j^T of the steps worked out.
+    first : int
+        Number of the first step, for messages.
 
     Raises
     ------
@@ -320,8 +327,8 @@ def prepare(
             )  # fmt: skip
             if singular >= 0:
                 raise ValueError(
-                    f"phi is singular at step {a + singular}: the information filter inverts it; methods 'rts' and "
-                    "'watanabe' do not"
+                    f"phi is singular at step {first + a + singular}: the information filter inverts it; methods 'rts' "
+                    "and 'watanabe' do not"
                 )
             observe(share(h, part), ends, rows[: own.size])
         yield Prepared(part, ends, es, at, rows, own, marks, steps)

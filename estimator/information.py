@@ -173,6 +173,7 @@ def filter(
     rule: Rule | None = None,
     store: Store | None = None,
     estimates: bool = True,
+    first: int = 0,
 ) -> tuple[Carry, Filtered]:
     """Filter N >= 0 steps; the same steps in any chunks give the same bits.
 
@@ -190,6 +191,8 @@ def filter(
         Receives the snapshots that smoothing needs.
     estimates : bool
         False leaves ``mean`` and ``std`` empty (shape (0, n)) and saves their time.
+    first : int
+        Number of the first step, for messages.
 
     Returns
     -------
@@ -199,7 +202,7 @@ def filter(
     ------
     ValueError
         phi singular, a measurement infinite, or an estimate overflowing: named with the step; shapes that do not fit.
-        The carry and the store are then as they were.
+        The carry is then as it was, and the store holds the steps it held.
     """
     n = model.n
     rule = Rule.of(model) if rule is None else rule
@@ -216,7 +219,7 @@ def filter(
     mean, std = np.empty((shown, n, records), model.dtype), np.empty((shown, n), model.dtype)
     nis, dof = np.empty((count, records), model.dtype), np.empty(count, np.int64)
     if count:
-        carry = _sweep(model, carry, data, rule, store, estimates, mean, std, nis, dof)
+        carry = _sweep(model, carry, data, rule, store, estimates, first, mean, std, nis, dof)
     if data.ndim == 3:
         return carry, Filtered(mean.transpose(2, 0, 1), std, nis.T, dof)
     return carry, Filtered(mean[:, :, 0], std, nis[:, 0], dof)
@@ -224,7 +227,7 @@ def filter(
 
 def _sweep(
     model: LinearModel, carry: Carry, data: Array, rule: Rule, store: Store | None, estimates: bool,
-    mean: Array, std: Array, nis: Array, dof: Order,
+    first: int, mean: Array, std: Array, nis: Array, dof: Order,
 ) -> Carry:  # fmt: skip
     """The new carry after all steps of ``data`` (N, m) or (records, N, m); fills the results."""
     count, dtype = data.shape[-2], model.dtype
@@ -232,14 +235,14 @@ def _sweep(
     rho = np.array(carry.d[: carry.d.size - model.n])
     h, r, white = model.whitened(data)
     z = np.ascontiguousarray(white.transpose(1, 2, 0)) if white.ndim == 3 else white[:, :, None]
-    table = coordinates.table(model, rule)
+    table = coordinates.table(model, rule, count)
     if table is not None and not (carry.steps < len(table.phi) and np.array_equal(table.phi[carry.steps], carry.phi)):
         table = None  # the window began with another model
     shape = Shape(model.n, model.p, rho.size, dtype)
     kept = shape.rows(0) if store is None else store.reserve(shape, count, since, carry.steps, table)
     closed, at = np.empty(count, np.uint8), np.empty(count, np.int64)
     regular, own = carry.regular, None if store is None or table is not None else (kept.phi, kept.e)
-    for block in coordinates.prepare(model, h, rule, table, carry.phi, carry.steps, count, own):
+    for block in coordinates.prepare(model, h, rule, table, carry.phi, carry.steps, count, own, first):
         part, steps = block.part, block.steps
         closed[part], at[part] = block.closed, block.at
         regular, wrong = sweeps.forward(
@@ -251,8 +254,8 @@ def _sweep(
         )  # fmt: skip
         if wrong >= 0:
             raise ValueError(
-                f"the information is no longer finite at step {part.start + wrong}: check the units of phi, q and r "
-                "there"
+                f"the information is no longer finite at step {first + part.start + wrong}: check the units of phi, q "
+                "and r there; a direction that phi shrinks and no noise feeds does it too: then use method 'watanabe'"
             )
         since = np.eye(model.n, dtype=dtype) if steps == 0 else block.ends[block.at[-1]].copy()
     if store is not None:
@@ -299,6 +302,8 @@ class InformationFilter:
     def step(self, z: ArrayLike, model: LinearModel | None = None) -> Filtered:
         """One step: mean (n,), std (n,), nis and dof after measurement ``z`` (m,); ``model`` replaces the one given."""
         now = self.model.cut(self.steps, self.steps + 1) if model is None else model
-        self.carry, after = filter(now, self.carry, np.asarray(z, now.dtype)[None], rule=self.rule, store=self.store)
+        self.carry, after = filter(
+            now, self.carry, np.asarray(z, now.dtype)[None], rule=self.rule, store=self.store, first=self.steps
+        )
         self.steps += 1
         return Filtered(after.mean[0], after.std[0], after.nis[0], after.dof[0])

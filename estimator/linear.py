@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from estimator import rivals
 from estimator.information import Filtered, filter, start
 from estimator.model import LinearModel
-from estimator.smoother import Interval, backward, stretches
-from estimator.snapshots import SPILL, Store
+from estimator.smoother import backward
+from estimator.snapshots import Store
 from estimator.ud import Array
 from estimator.window import Rule
 
@@ -87,14 +87,16 @@ def smooth(
         2 filters a record from both ends to the middle and smooths it outwards, one thread each way: "ms" only, and the
         filter's estimates end in the middle (``middle``). Of many records, threads share the work.
     spill : path, optional
-        A folder for records whose steps or results do not fit in memory: snapshots go there, and the results are files
-        mapped into memory ("ms" only, one record).
+        A new or empty folder for a record whose steps or results do not fit in memory: snapshots go there while they
+        are needed, and the results are files in it, mapped into memory ("ms" only, one record, one thread).
 
     Raises
     ------
     ValueError
         Unknown method or result, or data that the method cannot use; names argument and step. ``Unobservable`` is one
         of them. So is a smoothed sigma above the filtered one, where both are wanted: lost digits, not an estimate.
+    FileExistsError
+        ``spill`` holds files already.
     """
     wanted = frozenset([want] if isinstance(want, str) else want)
     if not wanted <= frozenset(RESULTS):
@@ -118,7 +120,11 @@ def smooth(
             raise ValueError("spill is for one record, z of shape (N, m)")
         return _many(one, np.asarray(z, model.dtype), x0, wanted, threads, shared=method == "ms")
     if spill is not None:
-        return _spilled(model, model.measurements(z), x0, p0, rule, wanted, Path(spill))
+        if threads > 1:
+            raise ValueError("spill is for one thread: it keeps the snapshots of one pass")
+        on_disk = importlib.import_module("estimator.spilled")
+        result: Smoothed = on_disk.smooth(model, z, x0, p0, rule, wanted, Path(spill))
+        return result
     if threads > 1 and method == "ms":
         meet = importlib.import_module("estimator.middle")
         both: Smoothed = meet.smooth_from_both_ends(model, z, x0, p0, window, wanted)
@@ -134,51 +140,54 @@ def _ms(
     store = Store()
     carry = start(model.n, x0, p0, records=records, dtype=model.dtype)
     carry, filtered = filter(model, carry, z, rule=rule, store=store, estimates="filtered" in wanted)
-    smoothed = backward(store, carry, **_flags(wanted))
+    smoothed = backward(store, carry, **flags(wanted))
     if np.ndim(z) == 3 and records == 1:
         smoothed = smoothed._replace(mean=smoothed.mean[None])
-    mean, std = _from_epoch_0(model, x0, p0, filtered)
-    if smoothed.std.size and std.size and model.dtype == np.float64:
-        _believable(smoothed.std, std)
+    mean, std = from_epoch_0(model, x0, p0, filtered, wanted)
+    believable(smoothed.std, std)
     windows = [i for i in store.anchors if i < len(store)]
     return Smoothed(
         smoothed.mean, smoothed.covariance, smoothed.std, mean, std, windows, store.bytes_per_step, smoothed.cross
     )
 
 
-def _believable(smoothed: Array, filtered: Array) -> None:
-    """Raise ValueError where smoothing would be less sure than filtering, which only lost digits can bring about.
-
-    A mode that shrinks 1e-4-fold per step and is fed by no noise for several steps leaves too little of itself to be
-    followed backward in float64.
-    """
-    lost = np.flatnonzero((smoothed > 1.001 * filtered).any(axis=1))
-    if lost.size:
-        raise ValueError(
-            f"the digits of epoch {lost[0]} are lost on the way back: without noise, phi shrinks some direction too "
-            "fast after it; method 'watanabe' smooths forward"
-        )
-
-
-def _flags(wanted: frozenset[str]) -> dict[str, bool]:
+def flags(wanted: frozenset[str]) -> dict[str, bool]:
+    """What ``smoother.backward`` has to be asked for."""
     return {name: name in wanted for name in ("std", "covariance", "cross")}
 
 
-def _from_epoch_0(
-    model: LinearModel, x0: ArrayLike | None, p0: ArrayLike | None, filtered: Filtered
+def from_epoch_0(
+    model: LinearModel, x0: ArrayLike | None, p0: ArrayLike | None, filtered: Filtered, wanted: frozenset[str]
 ) -> tuple[Array, Array]:
-    """The filter's estimates with the prior in front."""
-    shape = (*filtered.mean.shape[:-2], 0 if filtered.mean.shape[-2] == 0 else filtered.mean.shape[-2] + 1, model.n)
-    mean, std = np.full(shape, np.nan, model.dtype), np.full(shape[-2:], np.inf, model.dtype)
-    if shape[-2] == 0:
-        return mean, std
-    mean[..., 1:, :], std[1:] = filtered.mean, filtered.std
-    if x0 is not None and p0 is not None:
-        variance = np.asarray(p0, float)
-        mean[..., 0, :] = x0
-        std[0] = np.sqrt(variance if variance.ndim == 1 else np.diag(variance))
-        mean[..., 0, np.isinf(std[0])] = np.nan
+    """The filter's estimates with the prior in front: mean (.., N+1, n) and std (N+1, n); empty when not wanted."""
+    rows = filtered.mean.shape[-2] + 1 if "filtered" in wanted else 0
+    mean = np.full((*filtered.mean.shape[:-2], rows, model.n), np.nan, model.dtype)
+    std = np.full((rows, model.n), np.inf, model.dtype)
+    if rows:
+        mean[..., 1:, :], std[1:] = filtered.mean, filtered.std
+        if x0 is not None and p0 is not None:
+            variance = np.asarray(p0, float)
+            mean[..., 0, :] = x0
+            std[0] = np.sqrt(variance if variance.ndim == 1 else np.diag(variance))
+            mean[..., 0, np.isinf(std[0])] = np.nan
     return mean, std
+
+
+def believable(smoothed: Array, filtered: Array, first: int = 0) -> None:
+    """Raise ValueError where smoothing would be less sure than filtering, which only lost digits can bring about.
+
+    A mode that shrinks 1e-4-fold per step and is fed by no noise for several steps leaves too little of itself to be
+    followed backward in float64. Standard deviations (k, n) of the epochs from ``first`` on; nothing is said without
+    either of them, nor of float32, whose sigmas are worth less.
+    """
+    if not smoothed.size or not filtered.size or smoothed.dtype != np.float64:
+        return
+    lost = np.flatnonzero((smoothed > 1.001 * filtered).any(axis=1))
+    if lost.size:
+        raise ValueError(
+            f"the digits of epoch {first + lost[0]} are lost on the way back: without noise, phi shrinks some "
+            "direction too fast after it; method 'watanabe' smooths forward"
+        )
 
 
 def _many(
@@ -194,6 +203,9 @@ def _many(
     count = z.shape[0]
     if count == 0:
         raise ValueError("z has no records: (K, N, m) with K of at least 1 is needed")
+    first = None if x0 is None else np.asarray(x0, float)
+    if first is not None and not (first.ndim == 1 or (first.ndim == 2 and first.shape[0] == count)):
+        raise ValueError(f"x0 has shape {first.shape} beside {count} records: (n,) or ({count}, n) is needed")
     if shared:
         patterns = np.packbits(np.isnan(z).reshape(count, -1), axis=1)
         group = np.unique(patterns, axis=0, return_inverse=True)[1].reshape(-1)
@@ -205,14 +217,18 @@ def _many(
         for own in members
         for i, part in enumerate(np.array_split(own, min(threads, max(own.size // TOGETHER, 1))))
     ]
-    first = None if x0 is None else np.broadcast_to(np.asarray(x0, float), (count, np.shape(x0)[-1]))
+    priors = None if first is None else np.broadcast_to(first, (count, first.shape[-1]))
 
     def run(job: tuple[NDArray[np.int64], frozenset[str]]) -> Smoothed:
         part, asked = job
-        prior = None if first is None else first[part]
-        if shared:
-            return one(z[part], prior, asked)
-        alone = one(z[part[0]], None if prior is None else prior[0], asked)
+        prior = None if priors is None else priors[part]
+        try:
+            if shared:
+                return one(z[part], prior, asked)
+            alone = one(z[part[0]], None if prior is None else prior[0], asked)
+        except ValueError as error:
+            error.add_note(f"in record {', '.join(map(str, part[:9]))}{', ..' if part.size > 9 else ''}")
+            raise
         return alone._replace(mean=alone.mean[None], filtered_mean=alone.filtered_mean[None])
 
     if threads == 1:
@@ -239,64 +255,3 @@ def _many(
         mean, spread("covariance"), spread("std"), filtered, spread("filtered_std"), lead.windows,
         lead.bytes_per_step, spread("cross"),
     )  # fmt: skip
-
-
-def _spilled(
-    model: LinearModel, z: Array, x0: ArrayLike | None, p0: ArrayLike | None, rule: Rule, wanted: frozenset[str],
-    folder: Path,
-) -> Smoothed:  # fmt: skip
-    """A record whose snapshots and results are files in ``folder``; the results are mapped into memory."""
-    store, n, count = Store(folder), model.n, z.shape[0]
-    shapes = {
-        "mean": (n,),
-        "std": (n,),
-        "covariance": (n, n),
-        "cross": (n, n),
-        "filtered_mean": (n,),
-        "filtered_std": (n,),
-    }
-    asked = wanted | {"mean"} | ({"filtered_mean", "filtered_std"} if "filtered" in wanted else set())
-    lengths = {name: 0 if name not in asked else count if name == "cross" else count + 1 for name in shapes}
-    files = {name: _created(folder / f"{name}.npy", (lengths[name], *shapes[name]), model.dtype) for name in shapes}
-
-    def write(name: str, row: int, part: Array) -> None:
-        file, offset = files[name]
-        file.seek(offset + row * model.dtype.itemsize * int(np.prod(shapes[name])))
-        np.ascontiguousarray(part).tofile(file)
-
-    carry = start(n, x0, p0, dtype=model.dtype)
-    for a in range(0, count, SPILL):
-        b = min(a + SPILL, count)
-        carry, filtered = filter(model.cut(a, b), carry, z[a:b], rule=rule, store=store, estimates="filtered" in wanted)
-        if "filtered" in wanted:
-            mean, std = _from_epoch_0(model, x0, p0, filtered)
-            skip = 1 if a else 0
-            write("filtered_mean", a + skip, mean[skip:])
-            write("filtered_std", a + skip, std[skip:])
-
-    def room(a: int, b: int) -> Interval:
-        rows = {name: b - a + (name != "cross") if lengths[name] else 0 for name in shapes}
-        mean = np.empty((rows["mean"], n, 1), model.dtype)
-        return Interval(mean, *(np.empty((rows[name], *shapes[name]), model.dtype) for name in Interval._fields[1:]))
-
-    for a, part in stretches(store, carry, 0, room=room, **_flags(wanted)):
-        for name, array in zip(Interval._fields, part, strict=True):
-            skip = 1 if a and name != "cross" else 0
-            if lengths[name]:
-                write(name, a + skip, array[skip:])
-    arrays = {}
-    for name, (file, _) in files.items():
-        file.close()
-        path = folder / f"{name}.npy"
-        arrays[name] = np.load(path, mmap_mode="r") if lengths[name] else np.load(path)
-    windows = [i for i in store.anchors if i < len(store)]
-    return Smoothed(windows=windows, bytes_per_step=store.bytes_per_step, **arrays)
-
-
-def _created(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[BinaryIO, int]:
-    """An empty .npy file of this shape, and where its numbers begin."""
-    file = path.open("w+b")
-    np.lib.format.write_array_header_1_0(file, {"descr": dtype.str, "fortran_order": False, "shape": shape})
-    offset = file.tell()
-    file.truncate(offset + int(np.prod(shape)) * dtype.itemsize)
-    return file, offset

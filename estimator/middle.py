@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from estimator import ud
 from estimator.information import Carry, anchor, factors, filter, start
-from estimator.linear import Smoothed, smooth
+from estimator.linear import Smoothed, believable, flags, from_epoch_0, smooth
 from estimator.model import LinearModel
 from estimator.smoother import backward
 from estimator.snapshots import Store
@@ -85,7 +85,6 @@ def _meet(
     middle = (count + 1) // 2
     begin = start(n, x0, p0, dtype=model.dtype)
     ahead, behind = Store(), Store()
-    flags = {name: name in want for name in ("std", "covariance", "cross")}
     mean = np.empty((count + 1, n), z.dtype)
     std = np.empty((count + 1 if "std" in want else 0, n), z.dtype)
     covariance = np.empty((count + 1 if "covariance" in want else 0, n, n), z.dtype)
@@ -93,7 +92,7 @@ def _meet(
 
     def outward(store: Store, carry: Carry, *, back: bool) -> None:
         """Smooth one half. The second lies in the store from epoch N down to the middle, which the first writes."""
-        smoothed = backward(store, carry, **flags)
+        smoothed = backward(store, carry, **flags(want))
         epochs = slice(count, middle, -1) if back else slice(middle + 1)
         rows = count - middle if back else middle + 1
         for part, whole in ((smoothed.mean, mean), (smoothed.std, std), (smoothed.covariance, covariance)):
@@ -116,12 +115,8 @@ def _meet(
     filtered_mean = np.full((count + 1 if estimates else 0, n), np.nan, z.dtype)
     filtered_std = np.full_like(filtered_mean, np.inf)
     if estimates:
-        filtered_mean[1 : middle + 1], filtered_std[1 : middle + 1] = seen.mean, seen.std
-        if x0 is not None and p0 is not None:
-            variance = np.asarray(p0, float)
-            filtered_mean[0] = x0
-            filtered_std[0] = np.sqrt(variance if variance.ndim == 1 else np.diag(variance))
-            filtered_mean[0, np.isinf(filtered_std[0])] = np.nan
+        filtered_mean[: middle + 1], filtered_std[: middle + 1] = from_epoch_0(model, x0, p0, seen, want)
+    believable(std, filtered_std)
     windows = [i for i in ahead.anchors if i < middle]
     windows += [middle, *sorted(count - i for i in behind.anchors if 0 < i < count - middle)]
     return Smoothed(mean, covariance, std, filtered_mean, filtered_std, windows, ahead.bytes_per_step, cross)

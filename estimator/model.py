@@ -78,7 +78,7 @@ class LinearModel:
     it is refused. With a leading axis, (1, p, p) or (N, p, p), there is nothing to interpret.
     """
 
-    __slots__ = ("dtype", "gamma", "h", "m", "n", "p", "phi", "q", "r", "steps", "tables")
+    __slots__ = ("dtype", "gamma", "h", "m", "n", "p", "phi", "q", "r", "steps", "tables", "taken")
 
     def __init__(
         self,
@@ -93,7 +93,8 @@ class LinearModel:
         self.dtype = np.dtype(dtype)
         if self.dtype not in (np.float64, np.float32):
             raise ValueError(f"dtype is {self.dtype}: float64 or float32 is needed")
-        self.tables: dict[object, object] = {}  # what ``coordinates`` works out once for a constant model
+        self.tables: dict[object, object] = {}  # what ``coordinates`` works out once for a constant model,
+        self.taken = 0  # and the steps taken without
         self.phi = _stacked(phi, "phi", "n, n", self.dtype)
         self.gamma = _stacked(gamma, "gamma", "n, p", self.dtype)
         self.h = _stacked(h, "h", "m, n", self.dtype)
@@ -167,7 +168,7 @@ class LinearModel:
             raise IndexError(f"steps {first}..{stop} of a model of {self.steps} steps")
         part = LinearModel.__new__(LinearModel)
         part.n, part.p, part.m, part.steps, part.dtype = self.n, self.p, self.m, stop - first, self.dtype
-        part.tables = {}
+        part.tables, part.taken = {}, 0
         for name in ("phi", "gamma", "q", "h", "r"):
             array = getattr(self, name)
             setattr(part, name, array[first:stop] if array.shape[0] == self.steps else array)
@@ -176,8 +177,10 @@ class LinearModel:
     def measurements(self, z: ArrayLike) -> Array:
         """``z`` as a contiguous (N, m) or (records, N, m) array; ValueError when it does not fit the model."""
         array = _contiguous(z, "z", self.dtype)
-        if array.ndim not in (2, 3) or array.shape[-1] != self.m or array.shape[0] == 0 < array.ndim - 2:
-            raise ValueError(f"z has shape {array.shape}, (N, {self.m}) is needed")
+        if array.ndim not in (2, 3) or array.shape[-1] != self.m:
+            raise ValueError(f"z has shape {array.shape}, (N, {self.m}) is needed, or (K, N, {self.m}) for K records")
+        if array.ndim == 3 and array.shape[0] == 0:
+            raise ValueError(f"z has no records: (K, N, {self.m}) with K of at least 1 is needed")
         if self.steps is not None and array.shape[-2] != self.steps:
             raise ValueError(f"z has {array.shape[-2]} rows, the model {self.steps} steps")
         if np.isinf(array).any():
@@ -203,7 +206,7 @@ class LinearModel:
 def _stacked(value: ArrayLike, name: str, shape: str, dtype: DTypeLike) -> Array:
     array = _contiguous(value, name, dtype)
     if array.ndim == 2:
-        return array[None]
+        return array[None].copy()  # what is worked out from a constant model must not be left behind by its caller
     if array.ndim != 3:
         raise ValueError(f"{name} has shape {array.shape}, ({shape}) or (N, {shape}) is needed")
     return array

@@ -56,7 +56,7 @@ def smooth_records(records: Iterable[Record], *, threads: int | None = None, **o
     Raises
     ------
     ValueError
-        ``threads`` is less than 1.
+        ``threads`` is less than 1, or ``spill`` is among the options.
     Exception
         Of the first record that failed, as ``estimator.smooth`` raised it, with a note that tells which record it was.
         Records that have not begun are then left alone.
@@ -64,6 +64,8 @@ def smooth_records(records: Iterable[Record], *, threads: int | None = None, **o
     count = processors() if threads is None else threads
     if count < 1:
         raise ValueError(f"threads is {count}: at least 1 is needed")
+    if "spill" in options:
+        raise ValueError("spill is for one record: every record needs a folder of its own, with estimator.smooth")
     done: list[Smoothed] = []
     waiting: deque[Future[Smoothed]] = deque()
 

@@ -118,8 +118,9 @@ def stretches(
     n, count = carry.phi.shape[0], len(store)
     if not 0 <= first <= count:
         raise IndexError(f"first is {first}: the store holds {count} steps")
-    if count and store.shape.n != n:
-        raise ValueError(f"carry has {n} states, the store {store.shape.n}")
+    if count and (store.shape.n, store.shape.records, store.shape.dtype) != (n, carry.d.size - n, carry.d.dtype):
+        own = Shape(n, store.shape.p, carry.d.size - n, carry.d.dtype)
+        raise ValueError(f"carry has {own.states()}, the store {store.shape.states()}")
     store.check(carry.phi, carry.steps)
     closed_by_hand = carry.steps == 0
     if not closed_by_hand and store.begins[-1]:

@@ -23,10 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.coordinates import Table
+from estimator.coordinates import CONDITION, LENGTH, Table
 from estimator.ud import Array, Order
-from estimator.window import REASONS
 
+START = 3  # a window begun by hand: neither CONDITION nor LENGTH closed the one before
+REASONS = {CONDITION: "condition", LENGTH: "length", START: "start"}
 FIRST_ROOM = 64  # steps
 SPILL = 8192  # steps in a block on disk
 
@@ -48,6 +49,12 @@ class Shape(NamedTuple):
     p: int
     records: int
     dtype: np.dtype[Any]
+
+    def states(self) -> str:
+        """In words, what has to agree between a carry and a store."""
+        records = f" of {self.records} records" if self.records != 1 else ""
+        single = "" if self.dtype == np.float64 else f" in {self.dtype}"
+        return f"{self.n} states{records}{single}"
 
     def rows(self, count: int, *, own: bool = True) -> Rows:
         """Unwritten rows of ``count`` steps; without phi and e unless they are a block's ``own``."""
@@ -140,8 +147,8 @@ class Store:
     Parameters
     ----------
     folder : path, optional
-        Where full blocks are put, in .npy files; it is made when it is not there. None keeps everything in memory.
-        Files of steps that were dropped are deleted, the others stay.
+        Where full blocks are put, in .npy files; it is made when it is not there, and belongs to this store alone. None
+        keeps everything in memory. Files of steps that were dropped are deleted, the others stay.
     spill : int
         Steps in a block on disk. A single call of ``filter`` is one block at the least, however long.
 
@@ -161,8 +168,12 @@ class Store:
         self._begins: NDArray[np.uint8] = np.zeros(1, np.uint8)
         self._first = 0  # place of the oldest epoch held in _begins
         self._count = 0
+        if spill < 1:
+            raise ValueError(f"spill is {spill}: a block on disk has at least one step")
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
+            if any(self._folder.glob("steps-*.npy")):
+                raise FileExistsError(f"{self._folder} holds the steps of another store: choose an empty folder")
 
     def __len__(self) -> int:
         return self._count
@@ -248,15 +259,21 @@ class Store:
         ValueError
             The carry does not continue the steps held, or the shape has changed.
         """
+        while self._blocks and self._blocks[-1].end == 0 and self._blocks[-1].file is None:
+            self._blocks.pop()  # reserved by a call that failed
         if not self._blocks:
             self._shape = shape
         elif self._shape != shape:
-            raise ValueError(f"store holds {_told(self._shape)}, the model has {_told(shape)}")
+            raise ValueError(
+                f"store holds {self._shape.states()} and {self._shape.p} noise components, the model has "
+                f"{shape.states()} and {shape.p} noise components"
+            )
         else:
             self.check(phi, steps)
-        if self._blocks and self._folder is not None and len(self._blocks[-1]) >= self._spill:
-            self._put_away(self._blocks[-1])
         newest = self._blocks[-1] if self._blocks else None
+        done = newest is not None and (len(newest) >= self._spill or newest.table is not table)
+        if newest is not None and newest.file is None and self._folder is not None and done:
+            self._put_away(newest)
         if newest is None or newest.file is not None or newest.table is not table:
             room = shape.rows(max(FIRST_ROOM, count + 1), own=table is None)
             newest = _Block(room, table, np.empty(0 if table is None else room.qs.shape[0], np.int64))
@@ -289,9 +306,9 @@ class Store:
             self._first = 0
         a = self._first + self._count
         if steps == 0 and self._begins[a] == 0:
-            self._begins[a] = 3
-        self._begins[a + 1 : a + count + 1] = closed & 2
-        self._begins[a : a + count] |= closed & 1
+            self._begins[a] = START
+        self._begins[a + 1 : a + count + 1] = closed & LENGTH
+        self._begins[a : a + count] |= closed & CONDITION
         self._count += count
 
     def check(self, phi: Array, steps: int) -> None:
@@ -330,14 +347,8 @@ class Store:
         for name, part in zip(Rows._fields, block.room, strict=True):
             more = 1 if name == "phi" else 0
             held = part[block.first : block.end + more] if own or name not in ("phi", "e") else part
-            np.save(file.with_suffix(f".{name}.npy"), held)
+            with file.with_suffix(f".{name}.npy").open("xb") as out:  # never over the steps of another store
+                np.save(out, held)
         block.at = block.epochs().copy() if not own else block.at
         block.end, block.first, block.file = len(block), 0, file
         block.room = self._shape.rows(0)
-
-
-def _told(shape: Shape) -> str:
-    told = f"{shape.n} states and {shape.p} noise components"
-    if shape.records != 1:
-        told += f" of {shape.records} records"
-    return told if shape.dtype == np.float64 else f"{told} in {shape.dtype}"

@@ -35,13 +35,13 @@ from estimator.ud import (
 ud.follow(__file__)
 
 
-PIVOT = {
-    8: 1e-20,
-    4: 1e-9,
-}  # of L_jj, by bytes per number: a pivot below it is rounding (measured in float64: 4e-23 and
-# less), not information
-FAINT = {8: 1e-8, 4: 1e-4}  # smallest singular value of the scaled factor that counts as observed: in float64 rounding
-# reaches 3e-9 when measurement variances range over 18 decades, 3e-12 otherwise; solvable problems stay above 1e-5
+# By bytes per number. A pivot below PIVOT, measured by L_jj, is rounding and not information: rounding leaves 4e-23 and
+# less in float64. A direction is observed when the singular value of the scaled factor is above FAINT times the
+# largest: in float64 rounding reaches 3e-9 where measurement variances range over 18 decades, 3e-12 otherwise, and
+# solvable problems stay above 1e-5.
+PIVOT = {8: 1e-20, 4: 1e-9}
+FAINT = {8: 1e-8, 4: 1e-4}
+LARGE = 1e4  # sigmas: sums of smaller terms lose at most 2e-12 of a sigma, in float32 a thousandth
 
 
 def limits(dtype: np.dtype[Any]) -> tuple[float, float]:
@@ -125,7 +125,8 @@ def anchor(ut: Array, d: Array, phi: Array, regular: bool, eps: float) -> None:
     """Move the anchor to the present epoch: overwrite ``ut`` (n, K + n) and ``d``; ``phi`` (n, n) = phi_{j,0}.
 
     V = diag(I, phi^{-T}) [eta^T; U], then mwgs; states and their covariance do not change. The eta that comes out is
-    exact but amplifies rounding, so it is formed again from the state; but not while some direction is unknown
+    exact but amplifies rounding, so it is formed again from the state, U^T phi x*, wherever that is a sum of terms below
+    LARGE sigmas: a mode that has run away unseen makes huge terms that cancel. Never while some direction is unknown
     (``regular`` is false): pivots of rounding size stand for it then, and the state is nonsense along it.
     """
     n = phi.shape[0]
@@ -151,9 +152,13 @@ def anchor(ut: Array, d: Array, phi: Array, regular: bool, eps: float) -> None:
         for j in range(n):
             for t in range(data):
                 eta = moved[j, t]
+                size = abs(eta)
                 for i in range(j):
-                    eta += ut[j, data + i] * moved[i, t]
-                ut[j, t] = eta
+                    term = ut[j, data + i] * moved[i, t]
+                    eta += term
+                    size += abs(term)
+                if np.sqrt(d[j]) * size < LARGE:
+                    ut[j, t] = eta
 
 
 @compiled

@@ -35,20 +35,24 @@ T = TypeVar("T")
 
 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile with numba and keep the declared type. NaN and infinity keep their meaning: they mark what is missing."""
-    return cast(Callable[P, T], njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})(function))
+    """Compile with numba and keep the declared type.
+
+    NaN and infinity keep their meaning: they mark what is missing, and a division by zero is one of them, not an error.
+    """
+    flags = {"reassoc", "contract", "nsz"}
+    return cast(Callable[P, T], njit(cache=True, nogil=True, fastmath=flags, error_model="numpy")(function))
 
 
-def follow(caller: str) -> None:
-    """Make the file ``caller``, whose kernels call those here, at least as young as this one.
+def follow(caller: str, *callees: str) -> None:
+    """Make the file ``caller``, whose kernels call those here, and those of ``callees``, at least as young as these.
 
     numba's on-disk cache asks only whether the caller's own file has changed, and would go on running the old code of a
     changed callee.
     """
     with suppress(OSError):
-        here = Path(__file__).stat().st_mtime_ns
-        if Path(caller).stat().st_mtime_ns < here:
-            os.utime(caller, ns=(here, here))
+        youngest = max(Path(path).stat().st_mtime_ns for path in (__file__, *callees))
+        if Path(caller).stat().st_mtime_ns < youngest:
+            os.utime(caller, ns=(youngest, youngest))
 
 
 @compiled
@@ -94,11 +98,9 @@ def agee_turner(ut: Array, d: Array, a: Array, c: float) -> float:
     data = ut.shape[1] - n
     for j in range(n - 1, -1, -1):
         s = a[data + j]
-        if s == 0.0:
-            continue
         v = c * s
         dn = d[j] + v * s
-        if dn == 0.0:
+        if v == 0.0 or dn == 0.0:
             continue
         beta = v / dn
         rho = d[j] / dn
@@ -132,9 +134,9 @@ def agee_turner_all(ut: Array, d: Array, a: Array, c: Array, count: int) -> None
         for b in range(count):
             s = a[b, data + j]
             v = c[b] * s
-            if v == 0.0:
-                continue
             dn = d[j] + v * s
+            if v == 0.0 or dn == 0.0:
+                continue
             beta = v / dn
             rho = d[j] / dn
             c[b] *= rho

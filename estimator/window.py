@@ -16,8 +16,6 @@ import numpy as np
 from estimator.model import LinearModel
 from estimator.ud import Array
 
-REASONS = {1: "condition", 2: "length", 3: "start"}
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rule:

@@ -65,7 +65,7 @@ def test_a_step_is_a_random_walk_in_star_coordinates():
 @pytest.mark.parametrize("rule", [Rule(steps=7), Rule(steps=1), Rule(steps=40, kappa=50.0)])
 def test_the_table_of_a_constant_model_is_what_each_step_would_give(rule):
     model = constant(2, growth=1.0 if rule.kappa > 1e3 else 1.2)
-    table = coordinates.table(model, rule)
+    table = coordinates.table(model, rule, 60)
     ends, es, closed, left, _ = moved(model, rule, 60)
     at, marked, after = coordinates.phases(table, 0, 60)
     assert np.array_equal(table.phi[1:][at], ends) and np.array_equal(table.es[at], es)
@@ -78,8 +78,21 @@ def test_the_table_of_a_constant_model_is_what_each_step_would_give(rule):
 
 
 def test_what_varies_or_is_too_long_is_not_tabulated():
-    assert coordinates.table(problem(3).model, Rule()) is None
-    assert coordinates.table(constant(3), Rule(steps=coordinates.LONGEST_TABLE + 1)) is None
+    assert coordinates.table(problem(3).model, Rule(), 10**6) is None
+    assert coordinates.table(constant(3), Rule(steps=coordinates.LONGEST_TABLE + 1), 10**6) is None
+
+
+def test_a_window_is_tabulated_when_as_many_steps_have_been_taken():
+    model = constant(5)
+    assert [coordinates.table(model, Rule(steps=10), 3) is None for _ in range(4)] == [True, True, True, False]
+    assert coordinates.table(model, Rule(steps=10), 1) is coordinates.table(model, Rule(steps=10), 1)
+
+
+def test_a_constant_model_keeps_no_hold_of_its_callers_arrays():
+    phi = np.eye(2)
+    model = LinearModel(phi, np.eye(2), [1.0, 1.0], np.eye(2), [1.0, 1.0])
+    phi[0, 1] = 5.0
+    assert np.array_equal(model.phi[0], np.eye(2))
 
 
 def test_a_window_begun_with_another_model_goes_on_without_the_table():

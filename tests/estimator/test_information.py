@@ -237,3 +237,13 @@ def test_infinite_measurement_with_correlated_noise():
     z[6, 0] = -np.inf
     with pytest.raises(ValueError, match="z is infinite at step 6"):
         filter(case.model, start(4, **case.prior), z)
+
+
+def test_the_live_object_names_the_step_of_the_record():
+    live = InformationFilter(
+        LinearModel(np.eye(2), np.eye(2), [1.0, 1.0], np.eye(2), [1.0, 1.0]), [0.0, 0.0], [1.0, 1.0]
+    )
+    for _ in range(7):
+        live.step([1.0, 2.0])
+    with pytest.raises(ValueError, match="phi is singular at step 7"):
+        live.step([1.0, 2.0], LinearModel(np.zeros((2, 2)), np.eye(2), [1.0, 1.0], np.eye(2), [1.0, 1.0]))

@@ -253,6 +253,7 @@ def test_results_on_disk_are_those_in_memory(tmp_path):
     for name in inside._fields:
         assert np.array_equal(getattr(inside, name), getattr(outside, name), equal_nan=True)
     assert isinstance(outside.covariance, np.memmap) and (tmp_path / "covariance.npy").exists()
+    assert not list(tmp_path.glob("**/steps-*"))  # snapshots are gone when they have served
 
 
 @pytest.mark.parametrize(
@@ -281,3 +282,75 @@ def test_digits_lost_on_the_way_back_are_reported_and_not_returned():
     for make in STRESS:  # hard, and within reach
         record = make()
         smooth(record.model(np.float64), record.z, **record.prior)
+
+
+def test_results_on_disk_do_not_depend_on_blocks_and_name_the_steps_of_the_record(tmp_path, monkeypatch):
+    monkeypatch.setattr("estimator.spilled.SPILL", 30)
+    case = problem(9, 3, 1, 2, 100, missing=0.1)
+    inside = smooth(case.model, case.z, **case.prior, window=9, want=RESULTS)
+    outside = smooth(case.model, case.z, **case.prior, window=9, want=RESULTS, spill=tmp_path / "new")
+    for name in inside._fields:
+        assert np.array_equal(getattr(inside, name), getattr(outside, name), equal_nan=True)
+    phi = case.phi.copy()
+    phi[70] = 0.0
+    with pytest.raises(ValueError, match="phi is singular at step 70"):
+        smooth(case.but(phi=phi).model, case.z, **case.prior, spill=tmp_path / "bad")
+    assert not list((tmp_path / "bad").iterdir())  # what failed leaves nothing
+
+
+def test_results_on_disk_are_never_overwritten(tmp_path):
+    first = smooth(model(), np.ones((9, M)), x0=np.zeros(N), p0=np.ones(N), spill=tmp_path)
+    before = np.array(first.mean)
+    with pytest.raises(FileExistsError, match="is there already: choose a new or empty folder"):
+        smooth(model(), np.zeros((5, M)), x0=np.zeros(N), p0=np.ones(N), spill=tmp_path)
+    assert np.array_equal(first.mean, before)
+
+
+def test_no_steps_on_disk_give_the_prior(tmp_path):
+    prior = {"x0": np.arange(4.0), "p0": np.ones(4)}
+    for options in ({}, {"spill": tmp_path}):
+        smoothed = smooth(model(), np.empty((0, M)), **prior, **options)
+        assert np.array_equal(smoothed.filtered_mean, [np.arange(4.0)]) and np.array_equal(
+            smoothed.mean, [np.arange(4)]
+        )
+        assert np.array_equal(smoothed.filtered_std, np.ones((1, 4)))
+
+
+def unseen(seed, mode, gaps, steps=200):
+    """A mode that grows or decays, oblique, under gaps in which it runs away from all that is known of it."""
+    basis = np.array([[1.0, 0.4], [0.3, 1.0]])
+    phi = basis @ np.diag([mode, 1.0]) @ np.linalg.inv(basis)
+    rng = np.random.default_rng(seed)
+    z = rng.normal(size=(steps, 1))
+    z[rng.random(z.shape) < gaps] = np.nan
+    return LinearModel(phi, np.eye(2), [1.0, 1.0], [[0.0, 1.0]], [1.0]), z
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(("mode", "gaps"), [(0.2, 0.9), (0.2, 0.5), (1.3, 0.8), (2.0, 0.7)])
+def test_means_hold_where_a_mode_runs_away_in_a_gap(mode, gaps, threads):
+    for seed in range(6):
+        system, z = unseen(seed, mode, gaps)
+        prior = {"x0": np.zeros(2), "p0": np.ones(2)}
+        mean = smooth(system, z, **prior, threads=threads)
+        reference = smooth(system, z, **prior, method="watanabe")
+        assert in_sigmas(mean.mean, reference.mean, reference.std) < 1e-6 and relative(mean.std, reference.std) < 1e-6
+
+
+def test_records_that_do_not_belong_together_are_told_apart():
+    z = np.ones((3, 5, M))
+    with pytest.raises(ValueError, match=r"x0 has shape \(2, 4\) beside 3 records: \(n,\) or \(3, n\) is needed"):
+        smooth(model(), z, x0=np.zeros((2, N)), p0=np.ones(N))
+    with pytest.raises(ValueError, match=r"x0 has shape \(\) beside 3 records"):
+        smooth(model(), z, x0=0.0, p0=np.ones(N))
+    z[2, 1] = np.nan
+    z[2, 3, 0] = np.inf
+    with pytest.raises(ValueError, match="z is infinite at step 3") as caught:
+        smooth(model(), z, x0=np.zeros(N), p0=np.ones(N))
+    assert caught.value.__notes__ == ["in record 2"]
+
+
+def test_a_direction_that_only_shrinks_ends_in_an_error_that_says_so():
+    system = LinearModel([[1.0, 0.3], [0.0, 0.1]], [[1.0], [0.0]], [1.0], [[1.0, 0.0]], [1.0])
+    with pytest.raises(ValueError, match=r"no longer finite at step \d+: .* shrinks .* method 'watanabe'"):
+        smooth(system, np.ones((400, 1)), x0=np.zeros(2), p0=np.ones(2))

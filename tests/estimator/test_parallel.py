@@ -137,3 +137,8 @@ def test_at_least_one_thread_is_needed():
     with pytest.raises(ValueError, match="threads is 0: at least 1 is needed"):
         smooth_records([], threads=0)
     assert processors() >= 1
+
+
+def test_one_folder_is_not_for_many_records(tmp_path):
+    with pytest.raises(ValueError, match="spill is for one record"):
+        smooth_records([], spill=tmp_path)

@@ -135,3 +135,49 @@ def test_steps_of_a_constant_model_are_looked_up_and_not_kept():
         assert np.array_equal(sides(table, end, first=first)[1], sides(rows, end, first=first)[1])
     end, _ = filter(problem(8).model, end, problem(8).z, rule=Rule(steps=8), store=table)  # then another model
     assert len(table) == 90 and backward(table, end).mean.shape == (91, 4)
+
+
+def test_stores_do_not_share_a_folder(tmp_path):
+    case = problem(9, 4, 2, 2, 40)
+    one, other, carry = Store(tmp_path, spill=10), Store(tmp_path, spill=10), start(4, **case.prior)
+    half, _ = filter(case.model.cut(0, 20), carry, case.z[:20], store=one)
+    filter(case.model.cut(0, 20), carry, case.z[:20], store=other)
+    filter(case.model.cut(20, 40), half, case.z[20:], store=one)
+    with pytest.raises(FileExistsError):
+        filter(case.model.cut(20, 40), half, case.z[20:], store=other)
+    with pytest.raises(FileExistsError, match="holds the steps of another store: choose an empty folder"):
+        Store(tmp_path)
+    with pytest.raises(ValueError, match="spill is 0: a block on disk has at least one step"):
+        Store(spill=0)
+
+
+def test_parts_of_a_block_go_to_disk_when_another_begins(tmp_path):
+    case = problem(10, 4, 2, 2, 120)
+    constant = LinearModel(case.phi[0], case.gamma[0], case.q[0], case.h[0], case.r[0])
+    store, inside, carry = Store(tmp_path, spill=1000), Store(), start(4, **case.prior)
+    for a in range(0, 120, 20):
+        model = case.model.cut(a, a + 20) if a % 40 else constant
+        filter(model, carry, case.z[a : a + 20], rule=Rule(steps=5), store=inside)
+        carry, _ = filter(model, carry, case.z[a : a + 20], rule=Rule(steps=5), store=store)
+    assert len(list(tmp_path.glob("steps-*.b.npy"))) == 5
+    assert all(np.array_equal(a, b) for a, b in zip(backward(store, carry), backward(inside, carry), strict=True))
+
+
+def test_a_call_that_fails_leaves_no_trace_in_a_fresh_store():
+    store = Store()
+    with pytest.raises(ValueError, match="phi is singular at step 0"):
+        filter(LinearModel(np.zeros((2, 2)), np.eye(2), [1.0, 1.0], np.eye(2), [1.0, 1.0]), start(2), np.ones((3, 2)),
+               store=store)  # fmt: skip
+    case = problem(11)
+    carry, _ = filter(case.model, start(4, **case.prior), case.z, store=store)
+    assert len(store) == 20 and backward(store, carry).mean.shape == (21, 4)
+
+
+def test_a_carry_of_other_records_or_numbers_is_refused():
+    case = problem(12)
+    store = Store()
+    filter(case.model, start(4, **case.prior), case.z, store=store)
+    with pytest.raises(ValueError, match="carry has 4 states of 3 records, the store 4 states"):
+        backward(store, start(4, **case.prior, records=3))
+    with pytest.raises(ValueError, match="carry has 4 states in float32, the store 4 states"):
+        backward(store, start(4, **case.prior, dtype=np.float32))
