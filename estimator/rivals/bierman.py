@@ -27,11 +27,11 @@ from estimator import ud
 from estimator.linear import Smoothed
 from estimator.model import LinearModel
 from estimator.rivals import conditioning, entry
-from estimator.rivals.conditioning import carried, condition, project, square, variances
+from estimator.rivals.conditioning import carried, condition, finite, project, square, variances
 from estimator.ud import Array, agee_turner, compiled, factor, mwgs, solve
 from estimator.ud import bierman as downdate
 
-entry.renew(__file__, ud, conditioning)
+ud.follow(__file__, conditioning.__file__)
 
 
 @compiled
@@ -75,7 +75,7 @@ def absorb(ut: Array, d: Array, g: Array, q: float, y: Array, b: Array) -> float
 def forward(
     phi: Array, gamma: Array, q: Array, h: Array, r: Array, z: Array, x: Array, ut: Array, d: Array,
     x_pred: Array, kept_b: Array, kept_qs: Array, mean: Array, variance: Array,
-) -> None:  # fmt: skip
+) -> int:  # fmt: skip
     """Filter N steps.
 
     Parameters
@@ -84,6 +84,10 @@ def forward(
     x (n,), ut (n, n), d (n,) : the prior; left as the last filtered estimate
     x_pred (N, n), kept_b (N, p, n), kept_qs (N, p) : written for ``backward``
     mean, variance (N+1|0, n) : filtered
+
+    Returns
+    -------
+    The step after which the estimate is not finite, or -1.
     """
     n, p, m = x.size, gamma.shape[2], h.shape[1]
     u, w, weight = np.empty((n, n), phi.dtype), np.empty((n, n), phi.dtype), np.empty(n, phi.dtype)
@@ -120,6 +124,9 @@ def forward(
                 t /= downdate(ut, d, row, ri[c], k)
                 for a in range(n):
                     x[a] += k[a] * t
+        if not finite(d, x):
+            return i
+    return -1
 
 
 @compiled
@@ -205,7 +212,12 @@ def smooth(
     ------
     ValueError
         No prior: a covariance filter cannot start without one. p0 indefinite. phi singular: it is inverted on the way
-        back.
+        back. Numbers that are no longer finite, with the step.
+
+    Notes
+    -----
+    A direction that phi shrinks and no noise feeds is stretched on the way back, and its rounding errors with it: what
+    was known of it long before is lost, without a word as long as it stays finite. "watanabe" smooths forward.
     """
     mean, covariance = entry.prior("bierman", model, x0, p0)
     h, r, data = model.whitened(entry.measurements(model, z))
@@ -213,14 +225,22 @@ def smooth(
     x, (ut, d) = mean.astype(dtype), entry.factors(covariance, dtype)
     room = entry.Room.of(want, count, n, dtype)
     x_pred, b, qs = np.empty((count, n), dtype), np.empty((count, p, n), dtype), np.empty((count, p), dtype)
-    forward(
+    step = forward(
         model.phi, model.gamma, model.q, h, r, data, x, ut, d, x_pred, b, qs,
         room.filtered_mean, room.filtered_variance,
     )  # fmt: skip
+    if step >= 0:
+        raise entry.too_large("the filtered estimate", step)
     step = backward(
         model.phi, model.gamma, model.q, x_pred, b, qs, x, ut, d, float(np.finfo(dtype).eps), False,
         room.mean, room.variance, room.covariance, room.cross,
     )  # fmt: skip
     if step >= 0:
-        raise ValueError(f"phi is singular at step {step}: method 'bierman' inverts it; 'rts' and 'watanabe' do not")
+        raise ValueError(f"phi is singular at step {step}: method 'bierman' inverts it; 'watanabe' does not")
+    lost = room.lost()
+    if lost.size:
+        raise ValueError(
+            f"the estimate of epoch {lost[-1]} is no longer finite on the way back: the inverse of phi stretches a "
+            "direction too fast after it; method 'watanabe' smooths forward"
+        )
     return room.smoothed(n * p + p + n)

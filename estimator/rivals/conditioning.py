@@ -5,11 +5,12 @@ Matrices are held as in ``ud``: ``ut`` is the transpose of U.
 
 from __future__ import annotations
 
+import numpy as np
+
 from estimator import ud
-from estimator.rivals import entry
 from estimator.ud import Array, agee_turner, bierman, compiled, mwgs
 
-entry.renew(__file__, ud)
+ud.follow(__file__)
 
 
 @compiled
@@ -68,6 +69,16 @@ def condition(
         for i in range(n):
             k[i] = g[i] - k[i] / s
         agee_turner(ut, d, k, s)
+
+
+@compiled
+def finite(d: Array, x: Array) -> bool:
+    """Are all pivots ``d`` (n,) and all of the vector ``x`` (n,) numbers? One that is not makes all later ones so."""
+    lost = 0
+    for i in range(d.size):
+        if not (d[i] < np.inf and abs(x[i]) < np.inf):
+            lost += 1
+    return lost == 0
 
 
 @compiled

@@ -1,15 +1,11 @@
-"""What every rival does before and after its sweeps: arguments in, `Smoothed` out, and no stale machine code."""
+"""What every rival does before and after its sweeps: arguments in, `Smoothed` out, and what to say when it cannot."""
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
-from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from estimator import noise
 from estimator.linear import Smoothed
@@ -19,29 +15,23 @@ from estimator.ud import Array
 SEMIDEFINITE = 1e-12  # of its diagonal entry: a pivot of p0 closer to zero than that is zero
 
 
-def renew(file: str, *callees: ModuleType) -> None:
-    """Make ``file`` at least as young as the modules whose kernels its own kernels call; before these are compiled.
-
-    numba's on-disk cache asks only whether the file of a kernel has changed and would keep old code of a callee.
-    """
-    with suppress(OSError):
-        youngest = max(Path(str(module.__file__)).stat().st_mtime_ns for module in callees)
-        if Path(file).stat().st_mtime_ns < youngest:
-            os.utime(file, ns=(youngest, youngest))
-
-
 def measurements(model: LinearModel, z: ArrayLike) -> Array:
-    """Return z (N, m) of the model's type, NaN = missing; infinity is refused with its step."""
+    """Return z (N, m) of the model's type, NaN = missing: one record."""
     data = model.measurements(z)
-    infinite = np.isinf(data)
-    if infinite.any():
-        step = int(np.flatnonzero(infinite.any(axis=1))[0])
-        raise ValueError(f"z is infinite at step {step}; a missing measurement is NaN")
+    if data.ndim != 2:
+        raise ValueError(f"z has shape {data.shape}, (N, {model.m}) is needed: one record")
     return data
 
 
 def prior(method: str, model: LinearModel, x0: ArrayLike | None, p0: ArrayLike | None) -> tuple[Array, Array]:
-    """Return mean (n,) and covariance (n, n), float64 and free to be overwritten; `ValueError` when there is none."""
+    """Return mean (n,) and covariance (n, n), float64 and free to be overwritten.
+
+    Raises
+    ------
+    ValueError
+        There is none; a shape does not fit; an entry is not finite, or not in the type of the model; p0 is not
+        symmetric and positive semidefinite.
+    """
     if x0 is None or p0 is None:
         raise ValueError(
             f"method {method!r} needs x0 and p0: a covariance cannot hold 'no prior information'; 'ms' can"
@@ -52,9 +42,15 @@ def prior(method: str, model: LinearModel, x0: ArrayLike | None, p0: ArrayLike |
     n = model.n
     if mean.shape != (n,) or covariance.shape != (n, n):
         raise ValueError(f"x0 has shape {mean.shape} and p0 {covariance.shape}, ({n},) and ({n}, {n}) are needed")
+    covariance = np.ascontiguousarray(covariance)
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
-        raise ValueError("x0 or p0 is not finite")
-    return mean, np.ascontiguousarray(covariance)
+        way_out = "; only 'ms' takes an infinite variance" if np.isposinf(covariance.diagonal()).any() else ""
+        raise ValueError(f"x0 or p0 is not finite{way_out}")
+    with np.errstate(over="ignore"):
+        if not all(np.isfinite(a.astype(model.dtype)).all() for a in (mean, covariance)):
+            raise ValueError(f"x0 or p0 is not finite in {model.dtype}")
+    factors(covariance, covariance.dtype)
+    return mean, covariance
 
 
 def factors(p0: Array, dtype: np.dtype[np.float64]) -> tuple[Array, Array]:
@@ -85,6 +81,15 @@ class Room(NamedTuple):
             np.empty((cross, n, n), dtype), np.empty((live, n), dtype), np.empty((live, n), dtype),
         )  # fmt: skip
 
+    def lost(self) -> NDArray[np.int64]:
+        """Epochs whose smoothed estimate, or the part of it that is wanted, is not finite."""
+        lost = ~np.isfinite(self.mean)
+        second = self.variance
+        if not second.shape[0]:
+            second = np.einsum("jii->ji", self.covariance if self.covariance.shape[0] else self.cross)
+        lost[: second.shape[0]] |= ~np.isfinite(second)
+        return np.flatnonzero(lost.any(axis=1))
+
     def smoothed(self, numbers: int) -> Smoothed:
         """Deviations for variances; ``numbers`` per step went from one sweep to the other. One window, whatever N."""
         return Smoothed(
@@ -102,3 +107,11 @@ class Room(NamedTuple):
 def deviations(variance: Array) -> Array:
     """Standard deviations; NaN for a variance that rounding has made negative."""
     return np.sqrt(np.where(variance >= 0.0, variance, variance.dtype.type(np.nan)))
+
+
+def too_large(what: str, step: int) -> ValueError:
+    """Numbers have run out on the way forward; no method would have more of them."""
+    return ValueError(
+        f"{what} is no longer finite at step {step}: check the units of phi, q and r there; a direction that phi "
+        "stretches and no measurement tells does it too: then end the record before that step"
+    )

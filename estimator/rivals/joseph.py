@@ -16,13 +16,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from estimator import ud
 from estimator.linear import Smoothed
 from estimator.model import LinearModel
-from estimator.rivals import entry, rts
+from estimator.rivals import rts
 from estimator.rivals.rts import LOST, gain, innovate, mirror, noise, predict
 from estimator.ud import Array, compiled
 
-entry.renew(__file__, rts)
+ud.follow(__file__, rts.__file__)
 
 
 @compiled
@@ -165,13 +166,7 @@ def smooth(
     ValueError
         No prior: a covariance filter cannot start without one. A covariance that has lost its positive definiteness.
     """
-    room, x, p, x_pred, p_pred, data, r = rts.arrays("joseph", model, z, x0, p0, want)
-    step = forward(
-        model.phi, model.gamma, model.q, model.h, r, data,
-        x_pred, p_pred, x, p, room.filtered_mean, room.filtered_variance,
-    )  # fmt: skip
-    if step >= 0:
-        raise rts.lost_update(step)
+    room, x, p, x_pred, p_pred = rts.swept("joseph", forward, model, z, x0, p0, want)
     if want.isdisjoint({"std", "covariance", "cross"}):
         step = rts.backward_mean(model.phi, x_pred, p_pred, x, p)
     else:
@@ -179,3 +174,8 @@ def smooth(
     if step >= 0:
         raise rts.lost_prediction(step)
     return rts.finished(room, x, p, want)
+
+
+def filtered(model: LinearModel, z: ArrayLike, x0: ArrayLike | None, p0: ArrayLike | None) -> tuple[Array, Array]:
+    """Filter forward, and nothing else: mean and standard deviation (N+1, n), as ``rts.filtered``."""
+    return rts.live(rts.swept("joseph", forward, model, z, x0, p0, frozenset({"filtered"}))[0])

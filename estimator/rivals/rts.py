@@ -12,6 +12,8 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -320,13 +322,7 @@ def smooth(
     ValueError
         No prior: a covariance filter cannot start without one. A covariance that has lost its positive definiteness.
     """
-    room, x, p, x_pred, p_pred, data, r = arrays("rts", model, z, x0, p0, want)
-    step = forward(
-        model.phi, model.gamma, model.q, model.h, r, data,
-        x_pred, p_pred, x, p, room.filtered_mean, room.filtered_variance,
-    )  # fmt: skip
-    if step >= 0:
-        raise lost_update(step)
+    room, x, p, x_pred, p_pred = swept("rts", forward, model, z, x0, p0, want)
     if want.isdisjoint({"std", "covariance", "cross"}):
         step = backward_mean(model.phi, x_pred, p_pred, x, p)
     else:
@@ -336,10 +332,37 @@ def smooth(
     return finished(room, x, p, want)
 
 
-def arrays(
-    method: str, model: LinearModel, z: ArrayLike, x0: ArrayLike | None, p0: ArrayLike | None, want: frozenset[str]
-) -> tuple[entry.Room, Array, Array, Array, Array, Array, Array]:
-    """Check the arguments; room for results, x and p with the prior in row 0, x_pred, p_pred, z and r."""
+def filtered(model: LinearModel, z: ArrayLike, x0: ArrayLike | None, p0: ArrayLike | None) -> tuple[Array, Array]:
+    """Filter forward, and nothing else.
+
+    Returns
+    -------
+    mean, std : (N+1, n) arrays
+        Of epoch 0, the prior's, to N; a deviation is NaN where rounding has made the variance negative.
+
+    Raises
+    ------
+    ValueError
+        No prior; numbers that are no longer finite, or an innovation covariance that has lost definiteness.
+    """
+    return live(swept("rts", forward, model, z, x0, p0, frozenset({"filtered"}))[0])
+
+
+def live(room: entry.Room) -> tuple[Array, Array]:
+    """Mean and standard deviation (N+1, n) that the filter has left in ``room``."""
+    return room.filtered_mean, entry.deviations(room.filtered_variance)
+
+
+def swept(
+    method: str,
+    sweep: Callable[..., int],
+    model: LinearModel,
+    z: ArrayLike,
+    x0: ArrayLike | None,
+    p0: ArrayLike | None,
+    want: frozenset[str],
+) -> tuple[entry.Room, Array, Array, Array, Array]:
+    """Check the arguments, filter by ``sweep``; room for results, and x, p, x_pred and p_pred as ``forward`` writes."""
     mean, covariance = entry.prior(method, model, x0, p0)
     data = entry.measurements(model, z)
     n, count, dtype = model.n, data.shape[0], model.phi.dtype
@@ -347,7 +370,22 @@ def arrays(
     x[0], p[0] = mean, covariance
     r = model.r if model.r.ndim == 3 else model.r[:, :, None]
     room = entry.Room.of(want - {"covariance"}, count, n, dtype)
-    return room, x, p, np.empty((count, n), dtype), np.empty((count, n, n), dtype), data, r
+    x_pred, p_pred = np.empty((count, n), dtype), np.empty((count, n, n), dtype)
+    step = sweep(
+        model.phi, model.gamma, model.q, model.h, r, data,
+        x_pred, p_pred, x, p, room.filtered_mean, room.filtered_variance,
+    )  # fmt: skip
+    if step >= 0:
+        if not (np.isfinite(x_pred[step]).all() and np.isfinite(p_pred[step]).all()):
+            raise entry.too_large("the predicted estimate", step)
+        raise ValueError(
+            f"the innovation covariance at step {step} has lost positive definiteness; methods 'ms', 'bierman' and "
+            "'watanabe' keep factors, which cannot"
+        )
+    if not (np.isfinite(x[-1]).all() and np.isfinite(p[-1]).all()):  # what is not finite once remains so
+        finite = np.isfinite(x).all(axis=1) & np.isfinite(p).all(axis=(1, 2))
+        raise entry.too_large("the filtered estimate", int(np.argmin(finite)) - 1)
+    return room, x, p, x_pred, p_pred
 
 
 def finished(room: entry.Room, x: Array, p: Array, want: frozenset[str]) -> Smoothed:
@@ -357,11 +395,8 @@ def finished(room: entry.Room, x: Array, p: Array, want: frozenset[str]) -> Smoo
     return room.smoothed(2 * n + 2 * n * n)
 
 
-def lost_update(step: int) -> ValueError:
-    """The filter cannot go on."""
-    return ValueError(f"the innovation covariance at step {step} has lost positive definiteness; 'ms' keeps it")
-
-
 def lost_prediction(step: int) -> ValueError:
     """The smoother cannot go on."""
-    return ValueError(f"the predicted covariance at step {step} is not positive definite; 'ms' does not invert it")
+    return ValueError(
+        f"the predicted covariance at step {step} is not positive definite; 'watanabe' inverts neither it nor phi"
+    )

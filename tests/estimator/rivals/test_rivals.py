@@ -5,7 +5,7 @@ import pytest
 
 from estimator import LinearModel, smooth
 from estimator.linear import RESULTS
-from estimator.rivals import METHODS
+from estimator.rivals import METHODS, joseph, rts
 from tests.estimator.oracle import batch, in_correlation, in_sigmas, problem, relative
 
 KINDS = {
@@ -145,7 +145,11 @@ def test_no_steps_give_the_prior(method):
     [
         ({"x0": [0.0], "p0": np.eye(2)}, r"x0 has shape \(1,\)"),
         ({"x0": [0.0, np.nan], "p0": np.eye(2)}, "x0 or p0 is not finite"),
-        ({"x0": [0.0, 0.0], "p0": [1.0, np.inf]}, "x0 or p0 is not finite"),
+        ({"x0": [0.0, 0.0], "p0": [1.0, np.nan]}, "x0 or p0 is not finite$"),
+        ({"x0": [0.0, 0.0], "p0": [1.0, np.inf]}, "x0 or p0 is not finite; only 'ms' takes an infinite variance"),
+        ({"x0": [0.0, 0.0], "p0": [[1.0, 2.0], [2.0, 1.0]]}, "p0 is not symmetric and positive semidefinite"),
+        ({"x0": [0.0, 0.0], "p0": [[1.0, 0.5], [0.0, 1.0]]}, "p0 is not symmetric and positive semidefinite"),
+        ({"x0": [0.0, 0.0], "p0": [-1.0, 1.0]}, "p0 is not symmetric and positive semidefinite"),
     ],
 )
 def test_a_prior_that_does_not_fit_is_refused(arguments, message, method):
@@ -161,11 +165,51 @@ def test_a_covariance_cannot_start_from_nothing(method):
         smooth(model, [[1.0]], method=method)
 
 
-@pytest.mark.parametrize("method", ["bierman", "watanabe"])
-def test_an_indefinite_prior_has_no_factors(method):
-    model = LinearModel(np.eye(2), np.eye(2), [1.0, 1.0], np.eye(2), [1.0, 1.0])
-    with pytest.raises(ValueError, match="p0 is not symmetric and positive semidefinite"):
-        smooth(model, np.ones((3, 2)), x0=[0.0, 0.0], p0=[[1.0, 2.0], [2.0, 1.0]], method=method)
+@every
+@pytest.mark.parametrize("prior", [{"x0": [0.0, 1e40], "p0": [1.0, 1.0]}, {"x0": [0.0, 0.0], "p0": [1e40, 1.0]}])
+def test_a_prior_beyond_float32_is_refused_there(prior, method):
+    parts = np.eye(2), np.eye(2), [1.0, 1.0], np.eye(2), [1.0, 1.0]
+    with pytest.raises(ValueError, match="x0 or p0 is not finite in float32"):
+        smooth(LinearModel(*parts, dtype=np.float32), np.ones((3, 2)), **prior, method=method)
+    assert np.isfinite(smooth(LinearModel(*parts), np.ones((3, 2)), **prior, method=method).mean).all()
+
+
+@every
+def test_numbers_that_run_out_are_reported_with_the_step_and_not_returned(method):
+    model = LinearModel(1e200 * np.eye(2), np.eye(2), [1.0, 1.0], np.eye(2), [1.0, 1.0])
+    with pytest.raises(ValueError, match=r"no longer finite at step \d: check the units of phi"):
+        smooth(model, np.ones((5, 2)), x0=[0.0, 0.0], p0=[1.0, 1.0], method=method)
+
+
+@every
+def test_what_grows_unseen_until_numbers_run_out_ends_the_record_before_that(method):
+    # A standard deviation that grows 1.5-fold per step after the fifth, until its square is above 1.8e308.
+    model = LinearModel(np.diag([1.5, 0.9]), np.eye(2), [1.0, 1.0], np.eye(2), [1.0, 1.0])
+    z = np.full((2000, 2), np.nan)
+    z[:5] = 1.0
+    prior = {"x0": [0.0, 0.0], "p0": [1.0, 1.0], "method": method}
+    with pytest.raises(ValueError, match=r"no longer finite at step 879: .*end the record before that step"):
+        smooth(model, z, **prior)
+    smoothed = smooth(model, z[:870], **prior, want=RESULTS)
+    assert np.isfinite(smoothed.mean).all() and np.isfinite(smoothed.std).all()
+
+
+@pytest.mark.parametrize("name", ["rts", "joseph"])
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+def test_the_filter_alone_is_what_smoothing_calls_filtered(kind, name):
+    case = problem(10, 5, 2, 2, 15, **kind)
+    mean, std = {"rts": rts, "joseph": joseph}[name].filtered(case.model, case.z, case.x0, case.p0)
+    smoothed = smooth(case.model, case.z, **case.prior, method=name)
+    assert np.array_equal(mean, smoothed.filtered_mean) and np.array_equal(std, smoothed.filtered_std)
+
+
+@pytest.mark.parametrize("module", [rts, joseph])
+def test_the_filter_alone_runs_where_only_the_way_back_fails(module):
+    model = LinearModel(np.eye(2), np.zeros((2, 1)), [0.0], [[1.0, 0.0]], [1.0])
+    mean, std = module.filtered(model, [[1.0], [2.0]], [3.0, 4.0], [0.0, 0.0])
+    assert np.array_equal(mean, [[3.0, 4.0]] * 3) and np.array_equal(std, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=f"method '{module.__name__.split('.')[-1]}' needs x0 and p0"):
+        module.filtered(model, [[1.0], [2.0]], None, None)
 
 
 @every

@@ -32,13 +32,35 @@ def test_rts_takes_a_singular_phi():
     assert np.isfinite(smoothed.mean).all() and (smoothed.std > 0.0).all()
 
 
+@pytest.mark.parametrize("method", ["rts", "joseph"])
+@pytest.mark.parametrize(("phi", "p0"), [(np.diag([1.0, 0.0]), [1.0, 1.0]), (np.eye(2), [0.0, 0.0])])
+def test_a_prediction_without_inverse_is_refused_and_the_way_out_is_one(phi, p0, method):
+    model = LinearModel(phi, np.eye(2), [0.0, 0.0], np.eye(2), [1.0, 1.0])
+    record = {"z": np.ones((5, 2)), "x0": [0.0, 0.0], "p0": p0}
+    with pytest.raises(ValueError, match=r"predicted covariance at step 4 .*; 'watanabe' inverts neither it nor phi"):
+        smooth(model, **record, method=method)
+    smoothed = smooth(model, **record, method="watanabe")
+    assert np.isfinite(smoothed.mean).all() and np.isfinite(smoothed.std).all()
+
+
+def test_a_difference_of_covariances_that_turned_negative_is_refused_and_factors_are_the_way_out():
+    # A prior of 1e8, and the same sum measured again and again to 1e-6: what is left of its variance is rounding.
+    model = LinearModel(np.eye(2), np.zeros((2, 1)), [0.0], [[1.0, 0.3]], [1e-12])
+    record = {"z": np.ones((5, 1)), "x0": [0.0, 0.0], "p0": [1e8, 1e8]}
+    with pytest.raises(ValueError, match=r"innovation covariance at step 1 has lost .*'ms', 'bierman' and 'watanabe'"):
+        smooth(model, **record, method="rts")
+    along = 1e4 / np.hypot(1.0, 0.3)  # the deviation of the direction that no measurement tells
+    for method in ("ms", "bierman", "watanabe"):
+        assert np.allclose(smooth(model, **record, method=method).std, [0.3 * along, along], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({}, "method 'rts' needs x0 and p0"),
         ({"x0": [0.0], "p0": np.eye(2)}, r"x0 has shape \(1,\)"),
         ({"x0": [0.0, 0.0], "p0": [1.0, np.inf]}, "x0 or p0 is not finite"),
-        ({"x0": [0.0, 0.0], "p0": [-9.0, 1.0]}, "innovation covariance at step 0 has lost positive definiteness"),
+        ({"x0": [0.0, 0.0], "p0": [-9.0, 1.0]}, "p0 is not symmetric and positive semidefinite"),
         ({"x0": [0.0, 0.0], "p0": [0.0, 0.0]}, "predicted covariance at step 1 is not positive definite"),
     ],
 )

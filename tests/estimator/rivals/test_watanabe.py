@@ -105,6 +105,27 @@ def test_filtered_is_known_at_both_ends_only():
     assert np.isnan(fps.filtered_mean[1:-1]).all() and np.isinf(fps.filtered_std[1:-1]).all()
 
 
+def test_means_lose_digits_beside_near_perfect_measurements_and_no_more_than_is_said():
+    lost = {"ms": 0.0, "watanabe": 0.0}
+    for seed in range(20):
+        case = problem(seed, 4, 2, 2, 12, r_range=(1e-12, 1e6)).but(p0=1e8 * np.eye(4))
+        mean, std = exact(case)
+        for method in lost:
+            found = smooth(case.model, case.z, **case.prior, method=method).mean
+            lost[method] = max(lost[method], in_sigmas(found, mean, std))
+    assert lost["watanabe"] < 1e-3 and lost["ms"] < 1e-9, lost
+
+
+def test_information_that_grows_without_bound_is_for_a_filter():
+    # Without noise, measurements far ahead tell an unstable state at epoch 0 to more than 1e-154.
+    model = LinearModel(np.diag([1.5, 0.9]), np.eye(2), [0.0, 0.0], np.eye(2), [1.0, 1.0])
+    record = {"z": np.ones((2000, 2)), "x0": [0.0, 0.0], "p0": [1.0, 1.0]}
+    with pytest.raises(ValueError, match=r"later measurements is no longer finite at step \d+: .*'ms' or 'bierman'"):
+        smooth(model, **record, method="watanabe")
+    for method in ("ms", "bierman"):
+        assert np.isfinite(smooth(model, **record, method=method).mean).all()
+
+
 def test_half_a_prior_is_none():
     model = LinearModel(np.eye(1), np.eye(1), [1.0], [[1.0]], [1.0])
     with pytest.raises(ValueError, match="x0 and p0 come together"):
