@@ -138,7 +138,11 @@ def start(
             ut[np.ix_(index, records + index)] = factor.T
             ut[index, :records] = factor.T @ mean[:, known].T
             d[index] = weight
-    return _carry(ut.astype(dtype), d.astype(dtype), np.zeros(records, dtype), np.eye(n, dtype=dtype), 0, regular)
+    with np.errstate(over="ignore"):
+        ut, d = ut.astype(dtype), d.astype(dtype)
+    if not (np.isfinite(ut).all() and np.isfinite(d).all()):
+        raise ValueError(f"x0 or 1 / p0 is beyond {np.dtype(dtype)}")
+    return _carry(ut, d, np.zeros(records, dtype), np.eye(n, dtype=dtype), 0, regular)
 
 
 def _information(p0: Array) -> tuple[Array, Array]:

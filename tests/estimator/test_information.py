@@ -247,3 +247,8 @@ def test_the_live_object_names_the_step_of_the_record():
         live.step([1.0, 2.0])
     with pytest.raises(ValueError, match="phi is singular at step 7"):
         live.step([1.0, 2.0], LinearModel(np.zeros((2, 2)), np.eye(2), [1.0, 1.0], np.eye(2), [1.0, 1.0]))
+
+
+def test_a_prior_beyond_the_number_type_is_refused():
+    with pytest.raises(ValueError, match="x0 or 1 / p0 is beyond float32"):
+        start(2, [1e40, 0.0], [1.0, 1.0], dtype=np.float32)
