@@ -507,19 +507,20 @@ def bench_linear(*, quick: bool = False, json: bool = False) -> None:
 def bench_long(*, steps: int = 2_000_000, folder: Path | None = None) -> None:
     """A record that does not fit in memory, smoothed exactly: time per step, memory, what is kept on disk.
 
-    Needs 2.4 kB of disk per step while it runs.
+    Needs 2.5 kB of disk per step while it runs.
 
     Parameters
     ----------
     steps
-        Of a system with 12 states and 6 noise components, all matrices different from step to step.
+        Of a system with 12 states and 6 noise components, all matrices different from step to step; 4 or more.
     folder
-        For the snapshots and the true states, which stay there; without it a temporary one.
+        For the snapshots and the true states, which stay there; it must not hold those of an earlier run. Without it a
+        temporary one.
     """
-    from sims.experiments.long_record import run
+    from sims.experiments.long_record import FEWEST, M, N, run
 
-    if steps < 1:
-        raise ValueError(f"--steps is {steps}: at least 1 is needed")
+    if steps < FEWEST:
+        raise ValueError(f"--steps is {steps}: at least {FEWEST} are needed, {M} measurements each for {N} states")
     told = run(steps, folder, say)
     print(f"{told.steps:,} steps, {told.windows:,} windows: {told.disk / 1e9:.2f} GB of snapshots on disk")
     print(f"memory grew by {told.memory / 1e6:.0f} MB")

@@ -127,7 +127,9 @@ def move(
     """
     n, p = since.shape[0], gamma.shape[2]
     lu, order = np.empty((n, n), phi.dtype), np.empty(n, np.int64)
-    full = (p + 7) // 8 * 8  # columns, the last of them zero: whole registers instead of single numbers left over
+    full = (
+        p if p <= 4 else (p + 7) // 8 * 8
+    )  # columns, the last ones zero: whole registers instead of numbers left over
     g, e, v = np.zeros((n, full), phi.dtype), np.empty((n, full), phi.dtype), np.empty((4, n), phi.dtype)
     unit = np.eye(n).astype(phi.dtype)
     before = since

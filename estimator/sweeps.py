@@ -125,9 +125,9 @@ def anchor(ut: Array, d: Array, phi: Array, regular: bool, eps: float) -> None:
     """Move the anchor to the present epoch: overwrite ``ut`` (n, K + n) and ``d``; ``phi`` (n, n) = phi_{j,0}.
 
     V = diag(I, phi^{-T}) [eta^T; U], then mwgs; states and their covariance do not change. The eta that comes out is
-    exact but amplifies rounding, so it is formed again from the state, U^T phi x*, wherever that is a sum of terms below
-    LARGE sigmas: a mode that has run away unseen makes huge terms that cancel. Never while some direction is unknown
-    (``regular`` is false): pivots of rounding size stand for it then, and the state is nonsense along it.
+    exact but amplifies rounding, so it is formed again from the state, U^T phi x*, wherever that is a sum of terms
+    below LARGE sigmas: a mode that has run away unseen makes huge terms that cancel. Never while some direction is
+    unknown (``regular`` is false): pivots of rounding size stand for it then, and the state is nonsense along it.
     """
     n = phi.shape[0]
     data = ut.shape[1] - n

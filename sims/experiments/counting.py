@@ -12,7 +12,8 @@ were done in. A change of sign, a comparison, an absolute value and a copy cost 
 An operation that only exists because a matrix is stored with its zeros and ones, or because a sum starts from nothing,
 is *structural* and counted apart: an addition of an exact zero, a multiplication by an exact zero or one, a division of
 an exact zero or by an exact one. Operation counts on paper leave these out, so what is left, the *arithmetic*, is what
-may be compared with them; both together are what was *executed*. In dense random data no other zeros and ones arise.
+may be compared with them; both together are what was *executed*. In dense random data other zeros and ones arise only
+where an argument is one by choice: the scales of the window rule are, unless somebody gives them.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ is used; one that is not installed says so.
 from __future__ import annotations
 
 import atexit
+import importlib
 import importlib.util
 import os
 import sys
@@ -117,17 +118,30 @@ def _one(record: Record) -> None:
         raise Refused("one track")
 
 
-class Ours(_Known):
-    """`estimator.smooth` with one of its methods; the filter of "ms" is `estimator.information.filter`.
+def _forward(method: str) -> Callable[..., tuple[Array, Array]] | None:
+    """The filter alone of one of our rivals: model, z, x0 and p0 in, mean and standard deviation (N+1, n) out."""
+    from estimator import rivals
 
-    Of many tracks "ms" returns the covariances once, because they are the same.
+    module = importlib.import_module(rivals.METHODS[method])
+    found: Callable[..., tuple[Array, Array]] | None = getattr(module, "filtered", None)
+    return found
+
+
+class Ours(_Known):
+    """`estimator.smooth` with one of its methods; a filter is the forward pass alone where there is one to be had.
+
+    It is `estimator.information.filter` of "ms" and ``filtered`` of "rts" and "joseph"; "bierman" filters with its
+    smoother behind it, and is charged with what that one raises. Of many tracks "ms" returns the covariances once,
+    because they are the same.
     """
 
     def __init__(self, method: str = "ms", dtype: Any = np.float64, threads: int = 1) -> None:
         self.method, self.dtype, self.threads = method, np.dtype(dtype), threads
         single = ", float32" if self.dtype == np.float32 else ""
         self.name = f"ours, {method}{single}" + (f", {threads} threads" if threads > 1 else "")
-        self.many = self.alone = method == "ms"
+        self.many = method == "ms"
+        self.forward = None if method == "ms" else _forward(method)
+        self.alone = self.many or self.forward is not None
 
     def prepare(self, record: Record) -> tuple[Run | None, Run | None]:
         """As `Peer.prepare`."""
@@ -149,6 +163,9 @@ class Ours(_Known):
             return Estimates(found.mean, None, found.std)
 
         def filtered() -> Estimates:
+            if self.forward is not None:
+                mean, std = self.forward(model, z, record.x0, record.p0)
+                return Estimates(mean[1:], None, std[1:])
             found = smooth(model, z, **record.prior, method=self.method, want=("mean", "filtered"))
             return Estimates(found.filtered_mean[1:], None, found.filtered_std[1:])
 
@@ -266,7 +283,11 @@ class PyKalman(_Known):
 
 
 class Statsmodels(_Known):
-    """statsmodels' compiled KalmanSmoother; tolerance 0 keeps its shortcut to the steady state from being taken."""
+    """statsmodels' compiled KalmanSmoother; tolerance 0 keeps its shortcut to the steady state from being taken.
+
+    Without a prior and with a phi that varies its smoother is wrong at the first epoch alone (0.15.0): its filter there
+    and its smoother everywhere else are right to 1e-12, and with a constant phi all of it is.
+    """
 
     modules = ("statsmodels",)
 

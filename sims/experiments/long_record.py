@@ -22,6 +22,7 @@ from estimator.ud import Array
 
 N, P, M = 12, 6, 3
 BATCH = 8192  # steps
+FEWEST = -(-N // M)  # steps: fewer measurements do not tell the states, of which nothing is known before
 
 
 class LongRecord(NamedTuple):
@@ -69,11 +70,32 @@ def batches(steps: int, seed: int = 0) -> Iterator[tuple[LinearModel, Array, Arr
 
 
 def run(steps: int = 2_000_000, folder: Path | None = None, tell: Callable[[str], None] = lambda _: None) -> LongRecord:
-    """Filter and smooth a record of ``steps`` steps, which are kept in ``folder``; None: in a temporary one."""
+    """Filter and smooth a record, whose snapshots and true states are kept.
+
+    Parameters
+    ----------
+    steps : int
+        At least FEWEST.
+    folder : path, optional
+        Where they are kept, in "record"; None: in a temporary folder.
+    tell : called with a line about what is being done
+
+    Raises
+    ------
+    ValueError
+        Too few steps.
+    FileExistsError
+        ``folder`` holds an earlier record.
+    """
+    if steps < FEWEST:
+        raise ValueError(f"steps is {steps}: {N} states need {FEWEST} steps of {M} measurements at least")
     if folder is None:
         with tempfile.TemporaryDirectory() as own:
             return run(steps, Path(own), tell)
-    list(_pass(min(steps, 300), folder / "warm"))  # compiled before anything is counted
+    if any((folder / "record").glob("*.npy")):
+        raise FileExistsError(f"{folder} holds an earlier record: choose a new or an empty folder")
+    with tempfile.TemporaryDirectory() as warm:
+        list(_pass(min(steps, 300), Path(warm)))  # compiled before anything is counted
     before = _peak()
     windows = disk = 0
     squares = filtering = smoothing = 0.0
@@ -101,13 +123,14 @@ def _pass(steps: int, folder: Path, tell: Callable[[str], None] = lambda _: None
         count = b - a + 1
         return Interval(np.empty((count, N, 1)), np.empty((count, N)), np.empty((0, N, N)), np.empty((0, N, N)))
 
+    windows = sum(i < len(store) for i in store.anchors)  # one that ends with the record is followed by none
     begun, waited = time.perf_counter(), 0.0
     for a, part in stretches(store, carry, 0, True, False, False, room):
         paused = time.perf_counter()
         errors = (part.mean[1:, :, 0] - np.load(truths[a // BATCH])) / part.std[1:]
         waited += time.perf_counter() - paused
         spent = time.perf_counter() - begun - waited
-        yield LongRecord(steps, len(store.anchors), disk, 0, filtering, spent, float((errors * errors).sum()))
+        yield LongRecord(steps, windows, disk, 0, filtering, spent, float((errors * errors).sum()))
         if a // BATCH % 32 == 0 and a:
             tell(f"smoothed back to step {a:,}")
 

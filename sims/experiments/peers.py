@@ -26,12 +26,24 @@ from sims.experiments.libraries import ABSENT, Estimates, Numpy, Ours, Peer, Ref
 from sims.experiments.records import LIMITS, STRESS, Array, Record, Truth, benchmark, truth
 
 if TYPE_CHECKING:
+    from rich.console import Group
     from rich.table import Table
 
 SIZES = ((6, 3, 3), (10, 2, 2), (12, 6, 6), (30, 4, 4), (30, 15, 15))
 SETTINGS = ("one track, varying", "one track, constant", "64 tracks, constant")
 NONE = "-"  # there is no such filter or smoother
 TASKS = ("filter", "smooth")
+CAPTIONS = {
+    ("filter", ""): "ours give means and standard deviations, the others means and covariances; ms has to form them "
+    "from a factor of the information, rts and joseph read them off the covariance that they propagate",
+    ("filter", "constant"): "ms looks up phi_j,0 and E in a table of one window, made once, in the call not timed",
+    ("smooth", "constant"): "ms looks up phi_j,0 and E in a table of one window, made once, in the call not timed",
+}  # by task and what the setting says
+BEYOND = "*: beyond what is promised"
+UNCHECKED = (
+    "; of 'ms' covariances are asked for here, which it gives unchecked: asked for std and "
+    "filtered as well, as it is by default, smoothing compares the two and refuses this record"
+)
 AGREE = 1e-6  # sigma: a larger deviation is marked
 MEAN_WRONG, STD_WRONG = 0.1, 0.05  # sigma, and relative: beyond these an answer is wrong and not merely inexact
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # options of glibc's mallopt
@@ -74,7 +86,10 @@ class Timing:
     ratio : float or None
         To our "ms", median over the rounds.
     gap : float or None
-        Worst deviation from the numpy reference, of the mean in sigma or of sigma relatively.
+        Worst deviation from the numpy reference, of the mean in sigma or of sigma relatively; None where it is
+        infinite or NaN.
+    finite : bool
+        Whether every estimate was comparable: False with a ``gap`` of None.
     first : float or None
         Seconds of the first call: compilation, and one run.
     note : str
@@ -88,6 +103,7 @@ class Timing:
     microseconds: float | None = None
     ratio: float | None = None
     gap: float | None = None
+    finite: bool = True
     first: float | None = None
     note: str = ""
 
@@ -112,6 +128,10 @@ class Verdict:
     note : str
         Why it was not run, or the first words of what it raised.
     raised : bool
+    positive : bool
+        Whether it answered, with nothing but finite estimates, positive variances and symmetric covariances.
+    right : bool
+        Whether mean and sigma are usable: positive, and neither is off by what an engineer would notice.
     """
 
     record: str
@@ -124,16 +144,14 @@ class Verdict:
     std: float | None = None
     note: str = ""
     raised: bool = False
+    positive: bool = field(init=False)
+    right: bool = field(init=False)
 
-    @property
-    def positive(self) -> bool:
-        """Whether it answered, with nothing but finite estimates, positive variances and symmetric covariances."""
-        return self.mean is not None and not (self.negative or self.lost) and self.asymmetry <= STD_WRONG
-
-    @property
-    def right(self) -> bool:
-        """Whether mean and sigma are usable: positive, and neither is off by what an engineer would notice."""
-        return self.positive and (self.mean or 0.0) < MEAN_WRONG and (self.std or 0.0) < STD_WRONG
+    def __post_init__(self) -> None:
+        positive = self.mean is not None and not (self.negative or self.lost) and self.asymmetry <= STD_WRONG
+        object.__setattr__(self, "positive", positive)
+        right = positive and (self.mean or 0.0) < MEAN_WRONG and (self.std or 0.0) < STD_WRONG
+        object.__setattr__(self, "right", right)
 
 
 @dataclass(frozen=True)
@@ -152,7 +170,7 @@ class Comparison:
     timings: list[Timing] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[Group]:
         """Time by setting and task, then what is left of the hard records."""
         timed = [
             self._times(setting, task)
@@ -162,11 +180,12 @@ class Comparison:
         ]
         return timed + [self._judged(task) for task in TASKS if self.verdicts]
 
-    def _times(self, setting: str, task: str) -> Table:
+    def _times(self, setting: str, task: str) -> Group:
         from rich.table import Table
 
         what = "filter alone" if task == "filter" else "filter and smoother"
-        table = Table(title=f"{setting}: {what}, microseconds per step and track (times ours)")
+        caption = [text for (of, about), text in CAPTIONS.items() if of == task and about in setting]
+        table = Table()
         cells = {(t.peer, t.size): t for t in self.timings if (t.setting, t.task) == (setting, task)}
         table.add_column("")
         sizes = list(dict.fromkeys(t.size for t in cells.values() if t.size))
@@ -179,36 +198,48 @@ class Comparison:
                 continue
             gaps = [t.gap for t in row if t is not None and t.gap is not None]
             gap = f"{max(gaps):.0e}" + ("" if max(gaps) <= AGREE else " ✗") if gaps else ""
+            if not all(t is None or t.finite for t in row):
+                gap = "not finite ✗"
             table.add_row(peer, *(_time(t) for t in row), gap)
-        return table
+        return _headed(f"{setting}: {what}, microseconds per step and track (times ours)", table, caption)
 
-    def _judged(self, task: str) -> Table:
+    def _judged(self, task: str) -> Group:
         from rich.table import Table
 
         chosen = [v for v in self.verdicts if v.task == task]
         records = list(dict.fromkeys(v.record for v in chosen))
         raised = list(dict.fromkeys(v.note for v in chosen if v.raised))
         letters = {note: chr(ord("a") + i % 26) for i, note in enumerate(raised)}
-        caption = "\n".join(
-            [
-                "worst error of mean (in true sigma) or sigma (relative); ✗: over 0.1 sigma or 5 %; "
-                "N neg: variances not positive; N NaN: epochs lost; asym: covariances not symmetric; "
-                "-: it has no such method, or does not take the record",
-                "float32: error of sigma alone, for its means want deviations from a nominal",
-                *(f"✗ ({letters[note]}): {note}" for note in raised),
-            ]
-        )
-        name = "filters" if task == "filter" else "smoothers"
-        table = Table(title=f"hard records, {name}", caption=caption, caption_justify="left", padding=(0, 0))
+        beyond = {make().name for make in LIMITS}
+        caption = [
+            "worst error of mean (in true sigma) or sigma (relative); ✗: over 0.1 sigma or 5 %; "
+            "N neg: variances not positive; N NaN: epochs lost; asym: covariances not symmetric; "
+            "-: it has no such method, or does not take the record",
+            "float32: error of sigma alone, for its means want deviations from a nominal",
+        ]
+        if beyond & set(records):
+            caption.append(BEYOND + (UNCHECKED if task == "smooth" else ""))
+        caption += [f"✗ ({letters[note]}): {note}" for note in raised]
+        title = "filters" if task == "filter" else "smoothers"
+        table = Table(padding=(0, 0))
         table.add_column("", min_width=23)
         for record in records:
-            table.add_column(record, justify="right", min_width=8, no_wrap=True)
+            shown = f"{record}*" if record in beyond else record
+            table.add_column(shown, justify="right", min_width=8, no_wrap=True)
         cells = {(v.peer, v.record): v for v in chosen}
         for peer in dict.fromkeys(v.peer for v in chosen):
             absent = any(v.note == ABSENT for v in chosen if v.peer == peer)
             name = f"{peer}: {ABSENT}" if absent else peer
             table.add_row(name, *(_cell(cells.get((peer, record)), letters) for record in records))
-        return table
+        return _headed(f"hard records, {title}", table, caption)
+
+
+def _headed(title: str, table: Table, caption: Sequence[str]) -> Group:
+    """A table between title and caption that are as wide as the console, not as the table."""
+    from rich.console import Group
+    from rich.text import Text
+
+    return Group("", Text(title, "italic"), table, *(Text(line, "dim italic") for line in caption))
 
 
 def _time(timing: Timing | None) -> str:
@@ -316,7 +347,9 @@ def _measure(
             except Exception as error:
                 found[key] = replace(blank[task], note=_words(error))
                 continue
-            found[key] = replace(blank[task], gap=gap, first=time.perf_counter() - begin)
+            finite = gap is None or bool(np.isfinite(gap))
+            first = time.perf_counter() - begin
+            found[key] = replace(blank[task], gap=gap if finite else None, finite=finite, first=first)
             runs[key] = run, data.steps * data.tracks
     spent: dict[tuple[str, str], list[float]] = {key: [] for key in runs}
     for turn in range(effort.rounds):
@@ -400,7 +433,7 @@ def judge(record: str, peer: str, task: str, run: Run | None, known: Truth) -> V
         cov = np.asarray(found.covariance, float)[known_here]
         variance = np.einsum("jii->ji", cov)
         skew = np.abs(cov - cov.transpose(0, 2, 1)) / (std[:, :, None] * std[:, None, :])
-        asymmetry = float(np.nan_to_num(skew, nan=np.inf).max(initial=0.0))
+        asymmetry = float(np.nan_to_num(skew, nan=np.finfo(float).max).max(initial=0.0))
     else:
         assert found.std is not None
         variance = np.asarray(found.std, float)[known_here] ** 2

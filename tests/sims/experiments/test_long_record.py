@@ -4,7 +4,9 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
+import sortie
 from sims.experiments import long_record
 
 
@@ -26,4 +28,22 @@ def test_memory_does_not_grow_with_the_record(tmp_path):
     disk, memory, error, windows = (float(word) for word in done.stdout.split())
     assert disk > 0.9 * 120_000 * 8 * (12 * 12 + 2 * 12 * 6 + 2 * 6)  # all but the block still in memory
     assert memory < 0.5 * disk  # blocks in memory, not the record
-    assert abs(error - 1.0) < 0.01 and windows >= 1200
+    assert abs(error - 1.0) < 0.01
+    assert windows == 120_000 / 100  # and none that begins where the record ends
+
+
+def test_an_earlier_record_is_left_alone(tmp_path):
+    first = long_record.run(100, tmp_path)
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    assert first.windows == 1 and first.steps == 100
+    with pytest.raises(FileExistsError, match="holds an earlier record: choose a new or an empty folder"):
+        long_record.run(50, tmp_path)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before
+
+
+def test_as_few_steps_as_tell_the_states_are_enough_and_fewer_are_refused():
+    assert np.isfinite(long_record.run(long_record.FEWEST).error)
+    with pytest.raises(ValueError, match="steps is 3: 12 states need 4 steps of 3 measurements at least"):
+        long_record.run(3)
+    with pytest.raises(ValueError, match="--steps is 3: at least 4 are needed, 3 measurements each for 12 states"):
+        sortie.bench_long(steps=3)

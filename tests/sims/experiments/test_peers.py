@@ -11,8 +11,8 @@ from rich.console import Console
 from estimator import rivals, smooth
 from sims.experiments import libraries
 from sims.experiments.libraries import ABSENT, Estimates, Numpy, Ours
-from sims.experiments.peers import Effort, compare, deviation, judge
-from sims.experiments.records import STRESS, benchmark, three_axes, truth
+from sims.experiments.peers import Comparison, Effort, compare, deviation, judge
+from sims.experiments.records import STRESS, benchmark, dying, three_axes, truth
 
 TINY = Effort(sizes=((4, 2, 2),), fast=20, slow=10, tracks=6, rounds=2)
 hard = pytest.mark.parametrize("make", STRESS, ids=[make.__name__ for make in STRESS])
@@ -125,11 +125,65 @@ def test_a_library_that_breaks_is_a_row_that_says_how(tiny):
     assert all(v.raised and not v.right and v.mean is None for v in verdicts)
 
 
-def test_tables_fit_a_wide_terminal_and_figures_are_json(tiny):
-    console = Console(width=140, record=True, file=io.StringIO())
-    for table in tiny.tables():
+def printed(comparison, width):
+    console = Console(width=width, record=True, file=io.StringIO())
+    for table in comparison.tables():
         console.print(table)
-    text = console.export_text()
+    return console.export_text()
+
+
+def test_tables_fit_a_wide_terminal(tiny):
+    def framed(text):
+        return [line.rstrip() for line in text.splitlines() if line[:1] in "┏┃┡│└"]
+
+    # On the narrow one everything looks as it does where there is room to spare.
+    narrow, roomy = framed(printed(tiny, 140)), framed(printed(tiny, 1000))
+    assert narrow == roomy and len(roomy) > 20 and max(len(line) for line in roomy) <= 140
+
+
+def test_titles_are_in_one_line_whatever_the_table(tiny):
+    lines = [line.strip() for line in printed(tiny, 140).splitlines()]
+    for setting in ("one track, varying", "one track, constant", "64 tracks, constant"):
+        assert f"{setting}: filter and smoother, microseconds per step and track (times ours)" in lines
+    assert "hard records, smoothers" in lines
+
+
+def test_captions_tell_what_is_not_alike(tiny):
+    text = " ".join(printed(tiny, 140).split())
+    # one track and 64, each filter and smoother
+    assert text.count("made once, in the call not timed") == 4
+    assert text.count("ours give means and standard deviations, the others means and covariances") == 3
+
+
+def test_a_record_beyond_what_is_promised_is_marked():
+    verdicts = [judge(record, "ms", "smooth", None, None) for record in ("dying", "3 axes")]
+    text = " ".join(printed(Comparison({}, [], verdicts), 140).split())
+    assert "dying*" in text and "*: beyond what is promised" in text and "3 axes*" not in text
+    assert "beyond" not in printed(Comparison({}, [], verdicts[1:]), 140)
+
+
+def test_smoothing_as_by_default_refuses_that_record():
+    record = dying()
+    with pytest.raises(ValueError, match="lost on the way back"):
+        smooth(record.model(), record.z, **record.prior)
+
+
+@pytest.mark.parametrize("method", ["rts", "joseph"])
+def test_a_filter_is_not_charged_with_what_its_smoother_raises(method, monkeypatch):
+    record = benchmark(4, 2, 2, 20)
+    filtered, _ = Ours(method).prepare(record)
+
+    def broken(*_, **__):
+        raise ArithmeticError("the smoother breaks")
+
+    monkeypatch.setattr("estimator.smooth", broken)
+    assert deviation(filtered(), Numpy().prepare(record)[0]()) < 1e-9
+    with pytest.raises(ArithmeticError):
+        Ours(method).prepare(record)[1]()
+
+
+def test_tables_tell_everything_and_figures_are_json(tiny):
+    text = printed(tiny, 140)
     for expected in (
         "one track, varying: filter and smoother",
         "hard records, smoothers",
@@ -140,18 +194,41 @@ def test_tables_fit_a_wide_terminal_and_figures_are_json(tiny):
         assert expected in text
     figures = json.loads(msgspec.json.encode(tiny))
     assert set(figures) == {"machine", "timings", "verdicts"} and figures["machine"]["cores"]
+    for verdict, known in zip(figures["verdicts"], tiny.verdicts, strict=True):
+        assert (verdict["positive"], verdict["right"]) == (known.positive, known.right)
+    assert {verdict["right"] for verdict in figures["verdicts"]} == {True, False}
+
+
+class Lost(libraries._Known):
+    name = "a library that gives NaN"
+
+    def prepare(self, record):
+        filtered, smoothed = (run() for run in Numpy().prepare(record))
+        return lambda: filtered, lambda: smoothed._replace(mean=np.full_like(smoothed.mean, np.nan))
+
+
+def test_what_is_not_finite_is_told_in_tables_and_in_json():
+    found = compare(TINY, settings=["one track, constant"], stress=[], peers=[Lost()])
+    assert "not finite ✗" in printed(found, 140)
+    rows = [t for t in json.loads(msgspec.json.encode(found))["timings"] if t["peer"] == Lost.name]
+    assert {t["task"]: (t["finite"], t["gap"] is None) for t in rows} == {
+        "filter": (True, False),
+        "smooth": (False, True),
+    }
 
 
 @pytest.mark.filterwarnings("ignore")  # theirs
-def test_every_library_that_is_here_agrees():
+@pytest.mark.parametrize("peer", libraries.others(), ids=lambda peer: peer.name)
+def test_every_library_that_is_here_agrees(peer):
+    if reason := peer.available():
+        pytest.skip(f"{peer.name}: {reason}")
     for record in (benchmark(4, 2, 2, 30, varying=True), benchmark(4, 2, 2, 30), benchmark(4, 2, 2, 20, tracks=3)):
         references = [run() for run in Numpy().prepare(record)]
-        for peer in libraries.others():
-            if peer.available() or (record.tracks > 1 and not peer.many):
-                continue
-            try:
-                runs = peer.prepare(record)
-            except libraries.Refused:
-                continue
-            for run, reference in zip(runs, references, strict=True):
-                assert deviation(run(), reference) < 1e-5, peer.name
+        if record.tracks > 1 and not peer.many:
+            continue
+        try:
+            runs = peer.prepare(record)
+        except libraries.Refused:
+            continue
+        for run, reference in zip(runs, references, strict=True):
+            assert deviation(run(), reference) < 1e-5
