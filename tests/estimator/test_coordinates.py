@@ -26,7 +26,7 @@ def constant(seed, n=4, growth=1.0):
     return LinearModel(case.phi[0], case.gamma[0], case.q[0], case.h[0], case.r[0])
 
 
-@given(seeds, st.integers(1, 12), st.sampled_from([0.0, 3.0, 8.0]))
+@given(seeds, st.integers(1, 12), st.sampled_from([0.0, 2.0, 4.0]))
 @settings(max_examples=60, deadline=None)
 def test_the_estimated_condition_number_is_a_close_lower_bound(seed, n, spread):
     rng = np.random.default_rng(seed)
