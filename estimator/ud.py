@@ -316,15 +316,3 @@ def solve_transposed(lu: Array, order: Order, b: Array, x: Array) -> None:
         for j in range(i):
             rest[j] -= t * row[j]
         x[order[i]] = b[i]
-
-
-@compiled
-def multiply(a: Array, b: Array, out: Array) -> None:
-    """Fill ``out`` with A B; transition and measurement matrices are mostly zeros, which are skipped."""
-    for i in range(a.shape[0]):
-        out[i, :] = 0.0
-        for k in range(a.shape[1]):
-            t = a[i, k]
-            if t != 0.0:
-                for j in range(b.shape[1]):
-                    out[i, j] += t * b[k, j]

@@ -121,7 +121,7 @@ def test_a_setting_reaches_the_kernels_that_know_it():
     assert totals[True][0] > totals[False][0]
     assert np.allclose(totals[True][1].covariance, totals[False][1].covariance, rtol=1e-10, atol=1e-12)
     counting = Counting(no_such_argument=1)
-    counting.module("estimator.ud").multiply(np.ones((1, 1)), np.ones((1, 1)), np.empty((1, 1)))
+    counting.module("estimator.ud").faint(np.ones((1, 1)), 0, 1.0, 1e-20)
     assert counting.unheard == {"no_such_argument"}
 
 
