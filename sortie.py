@@ -467,7 +467,8 @@ def reproduce_shi(*, json: bool = False) -> None:
     import msgspec
     from rich.console import Console
 
-    from sims.experiments.operation_counts import figures, tables, tell
+    from sims.experiments.operation_counts import figures, tables
+    from sims.experiments.operation_tables import tell
 
     found = tables(told=lambda size: say(f"counting a step of n = {size.n}, p = {size.p}, m = {size.m}"))
     if json:

@@ -8,7 +8,7 @@ A streaming stage::
     carry, store, rule = start(n, x0, p0), Store(), Rule(scale=sigmas)
     for chunk, z in batches:                                 # a LinearModel and (N, m) measurements, NaN = missing
         carry, live = filter(chunk, carry, z, rule=rule, store=store)
-    mean, std = backward(store, carry, covariance=False)     # smoother.backward: the window just flown
+    flown = backward(store, carry, std=True, covariance=False)    # smoother.backward: the window just flown
     carry = anchor(carry)                                    # a mark: the next window begins here
     store.drop(len(store))
 """

@@ -79,8 +79,8 @@ def smooth(
     method : str
         "ms", or a method of ``estimator.rivals``.
     window : int, optional
-        Steps per window, None = 100; a condition number above 1e4 closes one earlier, so that whole-record windows stay
-        exact on unstable systems too. Methods without windows take no notice.
+        Steps per window, None = 100; a condition number above 1e4 (1e2 in float32) closes one earlier, so that
+        whole-record windows stay exact on unstable systems too. Methods without windows take no notice.
     want : names among "mean", "std", "covariance", "cross", "filtered"
         What is computed and returned; the mean always is.
     threads : int

@@ -19,9 +19,9 @@ from sims.experiments.operation_counts import (
     figures,
     problem,
     run,
-    tell,
     windows,
 )  # fmt: skip
+from sims.experiments.operation_tables import tell
 from sims.experiments.shi import METHODS, SIZES, Size
 
 SMALL = Size(10, 2, 2)
