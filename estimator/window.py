@@ -26,8 +26,8 @@ class Rule:
     steps : int
         Longest window; 1 is the ordinary U-D information filter.
     kappa : float
-        Largest infinity-norm condition number of S^{-1} phi_{j,0} S. It is formed every 8 steps, and at every step for
-        which the pivots at hand say that the limit is near. One step beyond the limit is a window of its own.
+        Largest infinity-norm condition number of S^{-1} phi_{j,0} S. It is estimated every 8 steps, and at every step
+        for which the pivots at hand say that the limit is near. One step beyond the limit is a window of its own.
     scale : (n,) array or None
         Typical standard deviation of each state, the diagonal of S. None is S = I, which only closes too early.
     """
@@ -38,7 +38,7 @@ class Rule:
 
     @classmethod
     def of(cls, model: LinearModel, steps: int = 100) -> Rule:
-        """The rule for a model: kappa is 1e4 in float64 and 1e2 in float32, where it costs the same digits of sigma."""
+        """The rule for a model: kappa is 1e4 in float64, and 1e2 in float32, which has half the digits to lose."""
         return cls(steps, 1e4 if model.dtype == np.float64 else 1e2)
 
     def __post_init__(self) -> None:
