@@ -141,6 +141,22 @@ class AirData(Message, frozen=True, kw_only=True, eq=False):
     stream: ClassVar[str] = "air_data"
 
 
+class FlowAngles(Message, frozen=True, kw_only=True, eq=False):
+    """Vanes or a multi-hole probe: the direction of the flow where they stand.
+
+    Parameters
+    ----------
+    alpha, beta : float array, shape (k,)
+        Angle of attack, atan2(w, u), and sideslip, asin(v / V), rad; NaN where one of the two is not measured.
+    """
+
+    alpha: Floats
+    beta: Floats
+
+    family: ClassVar[str] = "sensor"
+    stream: ClassVar[str] = "flow_angles"
+
+
 class Altitude(Message, frozen=True, kw_only=True, eq=False):
     """Pressure altimeter.
 
@@ -401,6 +417,129 @@ class Window(Message, frozen=True, kw_only=True, eq=False):
     widths: ClassVar[dict[str, int | str]] = {"mean": "names", "std": "names", "geodetic": 3}
 
 
+class Spread(msgspec.Struct, frozen=True, kw_only=True):
+    """How well a state was known over a stretch of flight: medians of the standard deviation, SI."""
+
+    name: str
+    unit: str
+    filtered: float | None
+    smoothed: float | None
+
+
+class Parameter(msgspec.Struct, frozen=True, kw_only=True):
+    """A constant that the estimator found, and what that is worth.
+
+    Parameters
+    ----------
+    name, unit : str
+    value, sigma : float or None
+        None where it is not observable: a number would be taken for one.
+    prior : float
+        Standard deviation before any measurement.
+    gain : float
+        Information gained, log2(prior / sigma), bits.
+    z : float or None
+        Distance from the same parameter in the other test points, in sigmas; None for the only one.
+    verdict : str
+        "consistent", "inconsistent" or "not observable".
+    why : str
+        The number behind the verdict, in words.
+    """
+
+    name: str
+    unit: str
+    value: float | None
+    sigma: float | None
+    prior: float
+    gain: float
+    z: float | None
+    verdict: Literal["consistent", "inconsistent", "not observable"]
+    why: str
+
+
+class Channel(msgspec.Struct, frozen=True, kw_only=True):
+    """What the innovations of one measured quantity say about its noise and about the model.
+
+    Parameters
+    ----------
+    name, unit : str
+    used, weakened, rejected : int
+        Scalars absorbed; of these with raised noise; refused by the gate.
+    nis : float or None
+        Mean of the normalised innovation squared, 1 if the model is right.
+    low, high : float or None
+        Band of the mean that chi-square allows, two-sided 99 %, for as many independent scalars.
+    lag1 : float or None
+        Correlation of successive innovations, 0 if the model is right.
+    verdict : str
+        "consistent", "over-confident" (above the band), "cautious" (below), "not white" or "no data".
+    why : str
+        Number and advice in words.
+    """
+
+    name: str
+    unit: str
+    used: int
+    weakened: int
+    rejected: int
+    nis: float | None
+    low: float | None
+    high: float | None
+    lag1: float | None
+    verdict: Literal["consistent", "over-confident", "cautious", "not white", "no data"]
+    why: str
+
+
+class Report(Message, frozen=True, kw_only=True, eq=False):
+    """What a test point, a window or a whole sortie is worth; one row, at its end.
+
+    Parameters
+    ----------
+    model : str
+    test_point : str
+        Empty between test points and for a whole sortie.
+    scope : str
+        "window", "test point" or "sortie".
+    window : int
+        Number of its last window.
+    begin : int
+        Time of its first estimate, ns.
+    states : tuple of Spread
+    parameters : tuple of Parameter
+    channels : tuple of Channel
+    gaps : dict of str to float
+        Seconds without inertial data, by what was done: "held", "interpolated", "lost" where the estimate ended.
+    loss : float or None
+        Share of the samples due that did not come, 0..1.
+    loss_effect : dict of str to float
+        By how much the loss raised the standard deviation of a state: factor by name.
+    findings : tuple of str
+        Defects of sensors and settings, each named with the number that shows it.
+    alarms : tuple of str
+        What makes the error bars untrustworthy.
+    digest : str
+        SHA-256 of inputs and configuration.
+    """
+
+    model: str
+    test_point: str
+    scope: Literal["window", "test point", "sortie"]
+    window: int
+    begin: int
+    states: tuple[Spread, ...]
+    parameters: tuple[Parameter, ...]
+    channels: tuple[Channel, ...]
+    gaps: dict[str, float]
+    loss: float | None
+    loss_effect: dict[str, float]
+    findings: tuple[str, ...]
+    alarms: tuple[str, ...]
+    digest: str
+
+    family: ClassVar[str] = "window"
+    stream: ClassVar[str] = "report"
+
+
 class Progress(Message, frozen=True, kw_only=True, eq=False):
     """Everything received up to ``t_rx[-1]`` has been told; with ``final``, nothing more will come.
 
@@ -420,6 +559,7 @@ KINDS: dict[str, type[Message]] = {
         Imu,
         Attitude,
         AirData,
+        FlowAngles,
         Altitude,
         Gnss,
         StatusText,
@@ -430,11 +570,12 @@ KINDS: dict[str, type[Message]] = {
         Event,
         Estimate,
         Window,
+        Report,
         Progress,
     )
 }
 
-SENSORS = (Imu, Attitude, AirData, Altitude, Gnss)
+SENSORS = (Imu, Attitude, AirData, FlowAngles, Altitude, Gnss)
 
 
 class Array(NamedTuple):

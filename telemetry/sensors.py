@@ -8,17 +8,18 @@ the same time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.messages import AirData, Altitude, Attitude, Gnss, Imu, Message
+from telemetry.messages import AirData, Altitude, Attitude, FlowAngles, Gnss, Imu, Message
 
 STANDARD_GRAVITY = 9.80665
 SEA_LEVEL_PRESSURE = 101325.0
-SEA_LEVEL_DENSITY = 1.225
+SEA_LEVEL_SOUND = 340.294  # m/s
 
 PATIENCE = 5_000_000_000  # ns without the better message, after which a lesser one is used again
 NEVER = -(1 << 62)
@@ -37,10 +38,12 @@ def pressure_altitude(pressure: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _calibrated_airspeed(differential: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Incompressible calibrated airspeed, m/s; a negative pressure, as at rest, gives a negative airspeed, not a root
-    of it.
+    """Calibrated airspeed, m/s, of subsonic compressible flow, V = a0 sqrt(5 ((q_c/p0 + 1)^(2/7) - 1)).
+
+    A negative pressure, as at rest, gives a negative airspeed, not a root of it.
     """
-    return np.sign(differential) * np.sqrt(2.0 * np.abs(differential) / SEA_LEVEL_DENSITY)
+    ratio = np.abs(differential) / SEA_LEVEL_PRESSURE
+    return np.sign(differential) * SEA_LEVEL_SOUND * np.sqrt(5.0 * np.expm1(2.0 / 7.0 * np.log1p(ratio)))
 
 
 def _vector(values: NDArray[Any], names: tuple[str, str, str], scale: float) -> NDArray[np.float64]:
@@ -74,7 +77,8 @@ def _scaled_imu(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
 def _attitude(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
     names = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
     angles = {name: values[field].astype(np.float64) for name, field in names.items()}
-    return _finite(angles), angles
+    compass = np.isnan(angles["phi"]) & np.isnan(angles["theta"]) & np.isfinite(angles["psi"])  # knows only a heading
+    return _finite(angles) | compass, angles
 
 
 def _attitude_quaternion(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
@@ -126,6 +130,19 @@ def _highres_air(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
     return _updated(values, 0x400) & _finite(columns), columns
 
 
+def _aoa_ssa(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    """Degrees on the wire; a vane that points backwards, or nowhere, measures nothing."""
+    angles = {name: values[field].astype(np.float64) for name, field in (("alpha", "AOA"), ("beta", "SSA"))}
+    columns = {name: np.where(np.abs(angle) <= 90.0, np.deg2rad(angle), np.nan) for name, angle in angles.items()}
+    return np.isfinite(columns["alpha"]) | np.isfinite(columns["beta"]), columns
+
+
+def _on_earth(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Rows whose latitude and longitude, 1e-7 degrees, exist."""
+    latitude, longitude = (np.abs(values[name].astype(np.int64)) for name in ("lat", "lon"))
+    return np.asarray((latitude <= 900_000_000) & (longitude <= 1_800_000_000))
+
+
 def _gps_raw_int(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
     rows = len(values)
     dilution = np.where((values["eph"] == 65535) | (values["eph"] == 0), 1.0, values["eph"] * 0.01)
@@ -138,14 +155,46 @@ def _gps_raw_int(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
     speed = _unless(values["vel"], 65535, 1e-2)
     course = np.deg2rad(_unless(values["cog"], 65535, 1e-2))
     velocity = np.stack([speed * np.cos(course), speed * np.sin(course), np.full(rows, np.nan)], axis=1)
-    inside = (np.abs(values["lat"].astype(np.int64)) <= 900_000_000) & (
-        np.abs(values["lon"].astype(np.int64)) <= 1_800_000_000
-    )
-    return (values["fix_type"] >= 3) & (values["fix_type"] <= 8) & inside, {
+    return (values["fix_type"] >= 3) & (values["fix_type"] <= 8) & _on_earth(values), {
         "latitude": np.deg2rad(values["lat"] * 1e-7),
         "longitude": np.deg2rad(values["lon"] * 1e-7),
         "altitude": values["alt"] * 1e-3,
         "velocity": velocity,
+        "sigma": sigma,
+        STAMP: values["time_usec"],
+        "satellites": np.where(values["satellites_visible"] == 255, -1, values["satellites_visible"].astype(np.int64)),
+    }
+
+
+def _gps_input(values: NDArray[Any]) -> tuple[NDArray[np.bool_], Columns]:
+    """A fix with all three components of velocity; whatever ``ignore_flags`` leaves out is not measured."""
+
+    def told(name: str, flag: int, otherwise: NDArray[np.float64] | float = math.nan) -> NDArray[np.float64]:
+        value = values[name].astype(np.float64)
+        return np.where(((values["ignore_flags"] & flag) == 0) & np.isfinite(value), value, otherwise)
+
+    def accuracy(name: str, flag: int, otherwise: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        value = told(name, flag)
+        return np.where(value > 0.0, value, otherwise)
+
+    dilution = accuracy("hdop", 2, 1.0)
+    dilution = np.where(dilution < 100.0, dilution, 1.0)  # 65535 is "unknown" here as well
+    vertical = accuracy("vdop", 4, 1.5 * dilution)
+    vertical = np.where(vertical < 100.0, vertical, 1.5 * dilution)
+    sigma = np.stack(
+        [
+            accuracy("horiz_accuracy", 64, GNSS_SIGMA * dilution),
+            accuracy("vert_accuracy", 128, GNSS_SIGMA * vertical),
+            accuracy("speed_accuracy", 32, GNSS_VELOCITY_SIGMA),
+        ],
+        axis=1,
+    )
+    altitude = told("alt", 1)
+    return (values["fix_type"] >= 3) & (values["fix_type"] <= 8) & _on_earth(values) & np.isfinite(altitude), {
+        "latitude": np.deg2rad(values["lat"] * 1e-7),
+        "longitude": np.deg2rad(values["lon"] * 1e-7),
+        "altitude": altitude,
+        "velocity": np.stack([told("vn", 8), told("ve", 8), told("vd", 16)], axis=1),
         "sigma": sigma,
         STAMP: values["time_usec"],
         "satellites": np.where(values["satellites_visible"] == 255, -1, values["satellites_visible"].astype(np.int64)),
@@ -171,7 +220,9 @@ FEEDS = (
     Feed(29, Altitude, 1, _scaled_pressure),
     Feed(105, AirData, 0, _highres_air),
     Feed(74, AirData, 1, _vfr_hud),
-    Feed(24, Gnss, 0, _gps_raw_int),
+    Feed(11020, FlowAngles, 0, _aoa_ssa),
+    Feed(232, Gnss, 0, _gps_input),
+    Feed(24, Gnss, 1, _gps_raw_int),
 )
 
 
@@ -214,7 +265,7 @@ class Sensors:
             One per sensor heard, rows in order of arrival.
         """
         messages: list[Message] = []
-        for kind in (Imu, Attitude, AirData, Altitude, Gnss):
+        for kind in (Imu, Attitude, AirData, FlowAngles, Altitude, Gnss):
             candidates = []
             for feed in FEEDS:
                 if feed.kind is kind and feed.msgid in decoded:
@@ -244,12 +295,15 @@ class Sensors:
             name: np.concatenate([c[2][name] for c in candidates])[order] for name in candidates[0][2]
         }
         keep = self._best(kind, rank, t_rx[rows])
-        if STAMP in columns:
-            keep &= self._new_fix(columns.pop(STAMP))
-        if not keep.any():
-            return None
         columns = {name: column[keep] for name, column in columns.items()}
         rows = rows[keep]
+        # Only after the ranking: two messages about one fix carry one stamp, and the better one must not fall to it.
+        if STAMP in columns and len(rows):
+            new = self._new_fix(columns.pop(STAMP))
+            columns = {name: column[new] for name, column in columns.items()}
+            rows = rows[new]
+        if not len(rows):
+            return None
         return kind(vehicle=self._vehicle, source=self._source, boot=boot, t=t[rows], t_rx=t_rx[rows], **columns)
 
     def _best(self, kind: type[Message], rank: NDArray[np.int64], t_rx: NDArray[np.int64]) -> NDArray[np.bool_]:

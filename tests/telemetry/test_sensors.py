@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from telemetry.mavlink import Dialect
-from telemetry.messages import AirData, Altitude, Attitude, Gnss, Imu
+from telemetry.messages import AirData, Altitude, Attitude, FlowAngles, Gnss, Imu
 from telemetry.sensors import PATIENCE, Sensors, pressure_altitude
 from tests.telemetry.test_frames import scan
 from tests.telemetry.wire import Sender
@@ -92,7 +92,7 @@ def test_static_pressure_is_hectopascal_on_the_wire():
 def test_negative_differential_pressure_keeps_its_sign():
     air = samples(highres(bits=0x400, diff_pressure=-0.5))[AirData]
     assert air.differential_pressure[0] == -50
-    assert air.airspeed[0] == pytest.approx(-math.sqrt(2 * 50 / 1.225))
+    assert air.airspeed[0] == pytest.approx(-math.sqrt(2 * 50 / 1.225), rel=1e-3)  # incompressible
 
 
 def test_attitude_from_angles_and_from_a_quaternion_agree():
@@ -147,6 +147,12 @@ def test_infinity_is_no_measurement_of_anything(value):
     )
 
 
+def test_a_compass_alone_has_a_heading_and_no_other_angle():
+    found = samples(mavlink.MAVLink_attitude_message(5, math.nan, math.nan, 1.0, 0, 0, 0))[Attitude]
+    assert found.psi[0] == 1.0
+    assert math.isnan(found.phi[0]) and math.isnan(found.theta[0])
+
+
 def test_when_the_better_message_falls_silent_the_lesser_is_used_again():
     sensors = Sensors(1, "0/1")
     samples(highres(zacc=-9.0), sensors=sensors)
@@ -160,3 +166,67 @@ def test_a_repeated_fix_is_no_new_measurement():
     first = samples(gps(us=1), gps(us=1), gps(us=2), sensors=sensors, t=[1, 1, 2])[Gnss]
     assert first.t.tolist() == [1, 2]
     assert Gnss not in samples(gps(us=2), sensors=sensors, t=[3])
+
+
+def vanes(alpha, beta, us=1000):
+    return mavlink.MAVLink_aoa_ssa_message(us, alpha, beta)
+
+
+def gps_input(fix=3, us=1000, flags=0, **more):
+    fields = {
+        "time_week_ms": 0, "time_week": 0, "fix_type": fix, "lat": 474000000, "lon": 85000000, "alt": 500.0,
+        "hdop": 1.0, "vdop": 2.0, "vn": 1.0, "ve": 2.0, "vd": -3.0, "speed_accuracy": 0.05, "horiz_accuracy": 1.5,
+        "vert_accuracy": 2.5, "satellites_visible": 9,
+    }  # fmt: skip
+    return mavlink.MAVLink_gps_input_message(us, 0, flags, *(fields | more).values())
+
+
+def test_vanes_are_degrees_on_the_wire():
+    flow = samples(vanes(5.0, -2.0))[FlowAngles]
+    np.testing.assert_allclose([flow.alpha[0], flow.beta[0]], np.radians([5.0, -2.0]))
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 90.5, -179.0])
+def test_a_vane_that_points_nowhere_is_not_measured_and_leaves_the_other(value):
+    flow = samples(vanes(value, 3.0))[FlowAngles]
+    assert math.isnan(flow.alpha[0])
+    assert flow.beta[0] == pytest.approx(math.radians(3))
+    assert not samples(vanes(value, value))
+
+
+def test_a_fix_with_its_vertical_velocity():
+    fix = samples(gps_input())[Gnss]
+    assert math.degrees(fix.latitude[0]) == pytest.approx(47.4)
+    assert fix.altitude[0] == 500
+    assert fix.velocity[0].tolist() == [1, 2, -3]
+    np.testing.assert_allclose(fix.sigma[0], [1.5, 2.5, 0.05])
+    assert fix.satellites[0] == 9
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_the_fix_with_vertical_velocity_goes_before_the_one_without(reverse):
+    sensors = Sensors(1, "0/1")
+    pair = [gps_input(us=200), gps(us=200)]
+    samples(gps_input(us=100), sensors=sensors)
+    found = samples(*(pair[::-1] if reverse else pair), sensors=sensors)[Gnss]
+    assert found.velocity.tolist() == [[1, 2, -3]]
+
+
+def test_what_the_flags_leave_out_is_not_measured():
+    fix = samples(gps_input(flags=8 | 16 | 32 | 64 | 128))[Gnss]
+    assert np.isnan(fix.velocity).all()
+    assert fix.sigma[0].tolist() == [2.5, 5.0, 0.3]
+    horizontal = samples(gps_input(flags=16))[Gnss]
+    np.testing.assert_array_equal(horizontal.velocity[0], [1, 2, math.nan])
+    assert Gnss not in samples(gps_input(flags=1)), "without a height it is no fix in three dimensions"
+
+
+@pytest.mark.parametrize("bad", [{"fix": 2}, {"fix": 0}, {"fix": 9}, {"lat": 950000000}, {"alt": math.nan}])
+def test_an_input_that_is_no_fix_is_no_measurement(bad):
+    assert Gnss not in samples(gps_input(**bad))
+
+
+def test_infinite_velocity_and_accuracy_are_not_believed():
+    fix = samples(gps_input(vn=math.inf, vd=math.nan, speed_accuracy=math.inf, horiz_accuracy=-1.0, hdop=65535.0))[Gnss]
+    np.testing.assert_array_equal(fix.velocity[0], [math.nan, 2, math.nan])
+    np.testing.assert_allclose(fix.sigma[0], [2.5, 2.5, 0.3])
