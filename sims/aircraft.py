@@ -8,15 +8,20 @@ from __future__ import annotations
 
 import math
 import os
+import tempfile
 from typing import Any, NamedTuple
 
 import jsbsim
+
+from sims.earth import EQUATOR, FLAT_GRAVITY, PLANETS, Planet, unroll
+from sims.truth import Array
 
 RATE = 400
 """Integration rate (Hz)."""
 
 FOOT = 0.3048
 SLUG_FOOT_PER_S2 = 0.3048  # one pound of force accelerates one slug by one ft/s2
+STANDARD_GRAVITY = 9.80665
 PASCAL_PER_PSF = 47.88025898
 KELVIN_PER_RANKINE = 5.0 / 9.0
 
@@ -48,6 +53,8 @@ class Airframe(NamedTuple):
         Climb rate that the engines sustain there (m/s).
     stick : float
         Factor on test inputs in pitch, on top of `pitch`, that keeps the load factor within about 1 +- 0.5.
+    agility : float
+        Factor on what a plan asks of the load factor beyond 1.
     backlash : float
         Half the dead travel of the elevator linkage (normalised command).
     """
@@ -60,6 +67,7 @@ class Airframe(NamedTuple):
     climb: float = 2.0
     stick: float = 1.0
     backlash: float = 0.0
+    agility: float = 1.0
 
 
 AIRFRAMES: dict[str, Airframe] = {
@@ -76,14 +84,14 @@ AIRFRAMES: dict[str, Airframe] = {
     "f15": Airframe(5000.0, 220.0, yaw=0.4, climb=6.0, stick=0.5),
     "f16": Airframe(5000.0, 200.0, roll=0.4, yaw=2.0, climb=6.0),
     "T37": Airframe(3000.0, 130.0, roll=0.75, yaw=0.5, climb=4.0, stick=0.8),
-    "T38": Airframe(5000.0, 200.0, pitch=1.5, roll=0.8, yaw=1.5, climb=6.0, stick=0.5),
+    "T38": Airframe(5000.0, 200.0, pitch=1.5, roll=0.8, yaw=1.5, climb=6.0, stick=0.5, agility=1.4),
     "A4": Airframe(5000.0, 200.0, pitch=0.8, roll=0.6, yaw=0.3, climb=6.0, stick=0.6),
 }
 """Aircraft of the installed JSBSim package that trim and fly the demonstration plan."""
 
 
 class State(NamedTuple):
-    """What a pilot sees at one instant: SI, rad; `climb_rate` is up, `rates` are body p, q, r."""
+    """What a pilot sees at one instant: SI, rad; `climb_rate` is up; `load` is the load factor, 1 in level flight."""
 
     altitude: float
     climb_rate: float
@@ -95,6 +103,7 @@ class State(NamedTuple):
     q: float
     r: float
     beta: float
+    load: float = 1.0
 
 
 class Controls(NamedTuple):
@@ -144,6 +153,18 @@ _COLUMNS = {
 }
 
 
+_FLAT_RADIUS = 1000.0 * EQUATOR
+_FLAT_PLANET = f"""<?xml version="1.0"?>
+<planet name="Flat">
+  <semimajor_axis unit="M"> {_FLAT_RADIUS} </semimajor_axis>
+  <semiminor_axis unit="M"> {_FLAT_RADIUS} </semiminor_axis>
+  <rotation_rate unit="RAD/SEC"> 0.0 </rotation_rate>
+  <GM unit="M3/SEC2"> {FLAT_GRAVITY * _FLAT_RADIUS**2} </GM>
+  <J2> 0.0 </J2>
+</planet>
+"""
+
+
 class Aircraft:
     """An aircraft in trimmed flight.
 
@@ -154,14 +175,16 @@ class Aircraft:
     altitude, airspeed : float, optional
         Height above mean sea level (m) and true airspeed (m/s); the airframe's own by default.
     place : Place
-        Start, on the rotating WGS-84 Earth.
+        Start.
+    planet : str
+        ``wgs84``, the rotating ellipsoid, or ``flat``, a plane with constant gravity that does not rotate.
     seed : int
         Of JSBSim's random numbers (turbulence).
 
     Raises
     ------
     AircraftError
-        Unknown name, or no trim at this altitude and airspeed.
+        Unknown name or planet, or no trim at this altitude and airspeed.
     """
 
     def __init__(
@@ -171,16 +194,21 @@ class Aircraft:
         altitude: float | None = None,
         airspeed: float | None = None,
         place: Place | None = None,
+        planet: Planet = "wgs84",
         seed: int = 1,
     ) -> None:
         if name not in AIRFRAMES:
             raise AircraftError(f"unknown aircraft {name!r}; known to trim: {', '.join(sorted(AIRFRAMES))}")
+        if planet not in PLANETS:
+            raise AircraftError(f"unknown planet {planet!r}; known: {', '.join(PLANETS)}")
         self.name = name
+        self.planet = planet
         self.airframe = AIRFRAMES[name]
         self.altitude = self.airframe.altitude if altitude is None else altitude
         self.airspeed = self.airframe.airspeed if airspeed is None else airspeed
+        self._place = Place() if place is None else place
         self._load(seed)
-        self._trim(Place() if place is None else place)
+        self._trim(self._place)
 
         manager = self._fdm.get_property_manager()
 
@@ -205,6 +233,8 @@ class Aircraft:
             jsbsim.set_logger(_Silent())
         self._fdm = jsbsim.FGFDMExec(None)
         self._fdm.set_debug_level(0)
+        if self.planet == "flat":
+            self._flatten()
         if not self._fdm.load_model(self.name):
             raise AircraftError(f"JSBSim cannot load {self.name!r} from {jsbsim.get_default_root_dir()}")
         self._discard_outputs()
@@ -212,6 +242,19 @@ class Aircraft:
         self._fdm["simulation/randomseed"] = seed
         # Buss2: rectangular Euler, the default, drifts 0.03 deg/min against its own rates.
         self._fdm["simulation/integrator/position/rotational"] = 7
+        if self.planet == "flat":
+            self._fdm["simulation/gravity-model"] = 0
+
+    def _flatten(self) -> None:
+        """Put the aircraft on a sphere a thousand times as large as the Earth, which neither turns nor bulges."""
+        # JSBSim reads planets only from files.
+        with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
+            file.write(_FLAT_PLANET)
+            file.flush()
+            if not self._fdm.load_planet(file.name, False):
+                raise AircraftError(
+                    "this version of JSBSim does not load a planet of one's own, so planet='flat' fails"
+                )
 
     def _discard_outputs(self) -> None:
         # Some models write a .csv into the working directory, with its header even when output is disabled.
@@ -247,8 +290,9 @@ class Aircraft:
 
     def state(self) -> State:
         """Return what the autopilot sees now."""
-        h, climb, v, *rest = (get() for get in self._state)
-        return State(h * FOOT, climb * FOOT, v * FOOT, *rest)
+        h, climb, v, phi, theta, psi, p, q, r, beta = (get() for get in self._state)
+        load = -self._forces[2]() * SLUG_FOOT_PER_S2 / self._mass() / STANDARD_GRAVITY
+        return State(h * FOOT, climb * FOOT, v * FOOT, phi, theta, psi, p, q, r, beta, load)
 
     def command(self, controls: Controls) -> None:
         """Set the controls; they hold until the next command."""
@@ -291,6 +335,13 @@ class Aircraft:
     def columns(self) -> list[float]:
         """Return the remaining quantities of one truth record, in the order of `column_names` (SI, rad)."""
         return [get() * factor for get, factor in self._columns]
+
+    def on_map(self, latitude: Array, longitude: Array) -> tuple[Array, Array]:
+        """Return recorded latitudes and longitudes (rad) on WGS-84: as they are, or from the flat Earth."""
+        if self.planet == "wgs84":
+            return latitude, longitude
+        # The start of the flight: the settling before the first record is flown on the same plane.
+        return unroll(latitude, longitude, (self._place.latitude, self._place.longitude), _FLAT_RADIUS)
 
     @staticmethod
     def column_names() -> tuple[str, ...]:

@@ -27,6 +27,11 @@ def pressure_altitude(pressure: Array) -> Array:
     return np.asarray(T0 / _LAPSE * (1.0 - (pressure / P0) ** (1.0 / _EXPONENT)))
 
 
+def standard_temperature(altitude: Array) -> Array:
+    """Return the temperature (K) of the standard atmosphere at a pressure altitude (m)."""
+    return np.asarray(T0 - _LAPSE * altitude)
+
+
 def impact_pressure(airspeed: Array, pressure: Array, temperature: Array) -> Array:
     """Return what a pitot tube feels above static (Pa): true airspeed (m/s), static pressure (Pa), temperature (K)."""
     mach = airspeed / (A0 * np.sqrt(temperature / T0))

@@ -32,6 +32,8 @@ class Targets(NamedTuple):
         Climb rate to hold (m/s, up).
     pitch : float or None
         Pitch attitude to hold (rad).
+    load : float or None
+        Load factor to hold; goes before everything else in pitch.
     pitch_gain, roll_gain, yaw_gain : float
         Factor on the feedback about each axis; below 1 during a test input.
     input_elevator, input_aileron, input_rudder : float
@@ -43,6 +45,7 @@ class Targets(NamedTuple):
     altitude: float | None = None
     climb_rate: float | None = None
     pitch: float | None = None
+    load: float | None = None
     pitch_gain: float = 1.0
     roll_gain: float = 1.0
     yaw_gain: float = 1.0
@@ -65,6 +68,9 @@ class Gains(NamedTuple):
     height: float = 0.20
     climb: float = 1.0
     climb_integral: float = 0.25
+    load: float = 0.05
+    load_integral: float = 0.25
+    load_forward: float = 0.14
     speed: float = 0.06
     speed_integral: float = 0.012
 
@@ -95,6 +101,7 @@ class Autopilot:
         self._theta_integral = 0.0
         self._speed_integral = 0.0
         self._bank_integral = 0.0
+        self._load_integral = 0.0
         self._climb = 0.0
 
     def command(self, s: State, targets: Targets) -> Controls:
@@ -109,6 +116,9 @@ class Autopilot:
         )
 
     def _elevator(self, s: State, targets: Targets) -> float:
+        if targets.load is not None:
+            return self._elevator_for_load(s, targets.load)
+        self._load_integral = 0.0
         g = self._gains
         free = targets.pitch_gain < 1.0
         if targets.pitch is not None:
@@ -123,6 +133,18 @@ class Autopilot:
             self._theta_integral = _clip(self._theta_integral + g.theta_integral * error / RATE, -0.3, 0.3)
         feedback = g.theta * error - g.theta_dot * theta_dot
         return self._trim.elevator - factor * (targets.pitch_gain * feedback + self._theta_integral)
+
+    def _elevator_for_load(self, s: State, load: float) -> float:
+        """Return the elevator of a proportional-integral loop on the load factor, damped in pitch rate."""
+        g = self._gains
+        # Where altitude or climb hold is to take over afterwards.
+        self._climb = s.climb_rate
+        error = load - s.load
+        self._load_integral = _clip(self._load_integral + g.load_integral * error / RATE, -0.5, 0.5)
+        # The pitch rate that bends the path at this load factor; damping about zero would fight it.
+        wanted = GRAVITY * (load - math.cos(s.theta) * math.cos(s.phi)) / max(s.airspeed, 1.0)
+        push = self._airframe.stick * (g.load_forward * (load - 1.0) + g.load * error + self._load_integral)
+        return self._trim.elevator - self._airframe.pitch * (self._theta_integral + push - g.theta_dot * (s.q - wanted))
 
     def _pitch_for_climb(self, s: State, targets: Targets, frozen: bool) -> float:
         """Return the pitch attitude that brings the climb rate to where it is wanted."""

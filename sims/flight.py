@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import msgspec
 import numpy as np
 
 from sims import aircraft as jsb
 from sims import autopilot, manoeuvres
 from sims import sensors as suite
-from sims.truth import Truth
+from sims.grades import Arms, Grade
+from sims.truth import Times, Truth
 
 if TYPE_CHECKING:
-    from sims.aircraft import Aircraft, Place
+    from sims.aircraft import Aircraft, Place, State
     from sims.autopilot import Autopilot, Targets
+    from sims.earth import Planet
     from sims.manoeuvres import Plan, Segment
 
 BOOT = 4_000_000_000
@@ -54,6 +60,8 @@ class Flight:
         Starts and stops of test points.
     start_utc : int
         UTC of the first record (ns since the Unix epoch).
+    wind : (float, float)
+        Steady wind, north and east (m/s, the way the air moves).
     """
 
     aircraft: str
@@ -63,6 +71,75 @@ class Flight:
     sensors: suite.Sensors
     marks: tuple[Mark, ...]
     start_utc: int
+    wind: tuple[float, float] = WIND
+
+    @property
+    def utc(self) -> Times:
+        """UTC of every record of the truth (N,), ns; the times of `sims.messages` are among them or between them."""
+        return np.asarray(self.start_utc + (self.truth.t - self.truth.t[0]))
+
+    def save(self, path: str | Path) -> None:
+        """Write the truth and what the sensors were to an .npz, which `sims.Truth.load` reads as well."""
+        said = self.sensors
+        about = _About(
+            self.aircraft,
+            self.plan,
+            self.seed,
+            self.start_utc,
+            self.wind,
+            said.grade,
+            said.arms,
+            said.latencies,
+            said.dropouts,
+        )
+        self.truth.save(path, flight=msgspec.json.encode(about).decode())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Flight:
+        """Read what `save` wrote; the sensors say the same again, bit for bit.
+
+        Raises
+        ------
+        ValueError
+            The file holds no flight, or one of another version.
+        """
+        truth = Truth.load(path)
+        with np.load(path, allow_pickle=False) as file:
+            if "flight" not in file:
+                raise ValueError(f"{path} holds a truth record but no flight: fly it with sims.fly and Flight.save it")
+            text = str(file["flight"])
+        try:
+            about = msgspec.json.decode(text, type=_About)
+        except msgspec.DecodeError as error:
+            raise ValueError(f"{path} is a flight of another version ({error}): fly it again") from None
+        sensors = suite.sense(
+            truth, about.grade, seed=about.seed, arms=about.arms, latencies=about.latencies, dropouts=about.dropouts
+        )
+        seconds = (len(truth) - 1) / truth.rate
+        return cls(
+            about.aircraft,
+            about.plan,
+            about.seed,
+            truth,
+            sensors,
+            _marks(about.plan, seconds),
+            about.start_utc,
+            about.wind,
+        )
+
+
+class _About(NamedTuple):
+    """What a file says about a flight beside its truth."""
+
+    aircraft: str
+    plan: manoeuvres.Plan
+    seed: int
+    start_utc: int
+    wind: tuple[float, float]
+    grade: Grade
+    arms: Arms
+    latencies: dict[str, float]
+    dropouts: tuple[tuple[str, float, float], ...]
 
 
 def fly(
@@ -75,10 +152,12 @@ def fly(
     altitude: float | None = None,
     airspeed: float | None = None,
     place: Place | None = None,
+    planet: Planet = "wgs84",
     wind: tuple[float, float] = WIND,
     turbulence: int = 0,
-    record_rate: int = 50,
-    gnss_latency: float = 0.0,
+    record_rate: int | None = None,
+    latencies: Mapping[str, float] | None = None,
+    dropouts: Sequence[suite.Dropout] = (),
     start_utc: int | None = None,
 ) -> Flight:
     """Fly a plan and listen to the sensors.
@@ -101,14 +180,18 @@ def fly(
         Trimmed height (m) and true airspeed (m/s); the airframe's own by default.
     place : Place, optional
         Where the flight starts.
+    planet : str
+        ``wgs84``, or ``flat`` for textbook equations of motion: constant gravity, no rotation (`sims.earth`).
     wind : (float, float)
         Steady wind, north and east (m/s, the way the air moves).
     turbulence : int
         Severity 0 (calm) .. 7 of MIL-F-8785C; its tables leave the air above some 3000 m calm at 1 and 2.
-    record_rate : int
-        Truth records per second; divides 400.
-    gnss_latency : float
-        Age of a GNSS solution at its time stamp (s).
+    record_rate : int, optional
+        Truth records per second; divides 400. The IMU's rate by default.
+    latencies : dict of str to float, optional
+        Seconds by which the samples of a sensor are older than their stamps, as ``{"gnss": 0.2}``.
+    dropouts : sequence of (str, float, float)
+        Sensor, and when it falls silent and speaks again (s from the first record), as ``[("gnss", 20, 30)]``.
     start_utc : int, optional
         UTC of the first record (ns since the Unix epoch); now by default.
 
@@ -122,18 +205,20 @@ def fly(
     seconds = flown.duration if duration is None else duration
     if not seconds > 0.0:
         raise manoeuvres.PlanError(f"a flight takes a positive number of seconds, not {seconds}")
+    record_rate = grade.rates.imu if record_rate is None else record_rate
     if record_rate < 1 or jsb.RATE % record_rate:
         raise manoeuvres.PlanError(f"the record rate must divide {jsb.RATE} Hz: {record_rate} does not")
-    plane = jsb.Aircraft(aircraft, altitude=altitude, airspeed=airspeed, place=place, seed=seed)
+    plane = jsb.Aircraft(aircraft, altitude=altitude, airspeed=airspeed, place=place, planet=planet, seed=seed)
     truth = _record(plane, flown, seconds, record_rate, wind, turbulence)
     return Flight(
         aircraft=aircraft,
         plan=flown,
         seed=seed,
         truth=truth,
-        sensors=suite.sense(truth, grade, seed=seed, gnss_latency=gnss_latency),
+        sensors=suite.sense(truth, grade, seed=seed, latencies=latencies, dropouts=dropouts),
         marks=_marks(flown, seconds),
         start_utc=time.time_ns() if start_utc is None else start_utc,
+        wind=wind,
     )
 
 
@@ -171,15 +256,18 @@ class _Pilot:
         state = self._plane.state()
         self.segment, since = self._plan.at(t)
         segment = self._plan.segments[self.segment]
-        if segment.climb:
+        if segment.climb or segment.load:
             self._climbing = True
         elif self._climbing:
             # The height a push-over from this climb rate ends at; holding today's height would overshoot.
             self._altitude = state.altitude + 2.0 * state.climb_rate
             self._climbing = False
-        self._plane.command(self._autopilot.command(state, self._targets(segment, since)))
+        self._plane.command(self._autopilot.command(state, self._targets(segment, since, state)))
 
-    def _targets(self, segment: Segment, since: float) -> Targets:
+    def _targets(self, segment: Segment, since: float, state: State) -> Targets:
+        if segment.load:
+            load = 1.0 + (segment.load_at(since) - 1.0) * self._plane.airframe.agility
+            return autopilot.Targets(bank=_bank(segment, load, state), airspeed=self._plane.airspeed, load=load)
         targets = autopilot.Targets(
             bank=segment.bank,
             airspeed=self._plane.airspeed * segment.airspeed,
@@ -198,6 +286,14 @@ class _Pilot:
                 return targets._replace(roll_gain=gain, yaw_gain=gain, input_aileron=value * airframe.roll)
             case "rudder":
                 return targets._replace(roll_gain=gain, yaw_gain=gain, input_rudder=value * airframe.yaw)
+
+
+def _bank(segment: Segment, load: float, state: State) -> float:
+    """Return the bank angle (rad) at which this load factor keeps the height; wings level where none is asked for."""
+    level = math.acos(1.0 / max(load, 1.0))
+    # Steeper in a climb and shallower in a descent, so that the height stays about where it was.
+    correction = 2.0 * state.climb_rate / max(state.airspeed, 1.0) * min(1.0, level / 0.5)
+    return math.copysign(min(max(level + correction, 0.0), abs(segment.bank)), segment.bank)
 
 
 def _record(
@@ -219,10 +315,10 @@ def _record(
             pilot.act(max(0.0, step / jsb.RATE))
         plane.step()
         inertial.append(plane.inertial())
-    return _truth(np.array(rows), np.array(inertial), np.array(segments, np.int64), every)
+    return _truth(plane, np.array(rows), np.array(inertial), np.array(segments, np.int64), every)
 
 
-def _truth(rows: np.ndarray, inertial: np.ndarray, segments: np.ndarray, every: int) -> Truth:
+def _truth(plane: Aircraft, rows: np.ndarray, inertial: np.ndarray, segments: np.ndarray, every: int) -> Truth:
     """Arrange columns; `inertial` starts one record interval before the first row, at 400 Hz."""
     n = len(rows)
     c = dict(zip(jsb.Aircraft.column_names(), rows.T, strict=True))
@@ -231,6 +327,7 @@ def _truth(rows: np.ndarray, inertial: np.ndarray, segments: np.ndarray, every: 
     middle = 0.5 * (inertial[:-1] + inertial[1:])
     mean = middle[: every * n].reshape(n, every, 6).mean(axis=1)
     airspeed = np.sqrt(c["u_air"] ** 2 + c["v_air"] ** 2 + c["w_air"] ** 2)
+    latitude, longitude = plane.on_map(c["latitude"], c["longitude"])
     record = every * 1_000_000_000 // jsb.RATE
 
     def stack(*names: str) -> np.ndarray:
@@ -238,8 +335,8 @@ def _truth(rows: np.ndarray, inertial: np.ndarray, segments: np.ndarray, every: 
 
     return Truth(
         t=BOOT + record * np.arange(n, dtype=np.int64),
-        latitude=c["latitude"].copy(),
-        longitude=c["longitude"].copy(),
+        latitude=latitude.copy(),
+        longitude=longitude.copy(),
         altitude=c["altitude"].copy(),
         velocity=stack("velocity_north", "velocity_east", "velocity_down"),
         attitude=stack("phi", "theta", "psi"),
@@ -255,4 +352,6 @@ def _truth(rows: np.ndarray, inertial: np.ndarray, segments: np.ndarray, every: 
         temperature=c["temperature"].copy(),
         controls=stack("elevator", "aileron", "rudder", "throttle"),
         segment=segments,
+        planet=plane.planet,
+        aircraft=plane.name,
     )

@@ -90,6 +90,10 @@ class Segment(NamedTuple):
         A test input.
     test_point : str or None
         Name of the test point that this segment belongs to. Neighbours with the same name are one test point.
+    load : tuple of (float, float)
+        Seconds from the start of the segment and load factor, linear in between: the elevator holds it, and the height
+        goes where it goes. In a turn the bank is then the one at which this load factor would keep the height, and
+        `bank` its limit and direction.
     """
 
     name: str
@@ -99,6 +103,17 @@ class Segment(NamedTuple):
     airspeed: float = 1.0
     input: Input | None = None
     test_point: str | None = None
+    load: tuple[tuple[float, float], ...] = ()
+
+    def load_at(self, t: float) -> float:
+        """Return the load factor asked for `t` seconds after the segment's start."""
+        before = self.load[0]
+        for after in self.load:
+            if t < after[0]:
+                share = (t - before[0]) / (after[0] - before[0]) if after[0] > before[0] else 0.0
+                return before[1] + share * (after[1] - before[1])
+            before = after
+        return before[1]
 
 
 class Point(NamedTuple):
@@ -147,7 +162,46 @@ def _plan(name: str, segments: Sequence[Segment]) -> Plan:
     return Plan(name, tuple(segments))
 
 
+def push_pull(test_point: str | None = None) -> Segment:
+    """Return a push-over, a pull-up and a push-over: a wide range of alpha, with the wings level."""
+    # Push, pull twice as long, push: climb rate and height end about where they began.
+    times = (0.0, 1.0, 1.8, 3.2, 4.8, 7.6, 9.2, 10.6, 11.4)
+    load = tuple(zip(times, (1.0, 1.0, 0.5, 0.5, 1.5, 1.5, 0.5, 0.5, 1.0), strict=True))
+    return Segment("push-over and pull-up", 13.0, load=load, test_point=test_point)
+
+
+def wind_up_turn(seconds: float = 34.0, load: float = 1.7, test_point: str | None = None) -> Segment:
+    """Return a turn that tightens, holds and unwinds: load factor, alpha and heading together."""
+    third = seconds / 3.0
+    profile = ((0.0, 1.0), (1.0, 1.0), (third, load), (2.4 * third, load), (2.8 * third, 1.0))
+    return Segment("wind-up turn", seconds, bank=math.radians(75.0), load=profile, test_point=test_point)
+
+
+def bank_to_bank(test_point: str | None = None) -> list[Segment]:
+    """Return bank to the right, to the left and back, 30 deg."""
+    right, left = (Segment(f"bank {side}", 6.0, test_point=test_point) for side in ("right", "left"))
+    level = Segment("wings level", 5.0, test_point=test_point)
+    return [right._replace(bank=_BANK), left._replace(bank=-_BANK), level]
+
+
+def _pitch(seconds: float = 9.0, test_point: str | None = None) -> Segment:
+    return Segment("3-2-1-1 in pitch", seconds, input=three_two_one_one(delay=1.0), test_point=test_point)
+
+
+def _roll(seconds: float = 6.0, test_point: str | None = None) -> Segment:
+    return Segment("aileron doublet", seconds, input=doublet(delay=1.0), test_point=test_point)
+
+
+def _yaw(seconds: float = 7.0, test_point: str | None = None) -> Segment:
+    return Segment("rudder doublet", seconds, input=doublet("rudder", amplitude=0.2, delay=1.0), test_point=test_point)
+
+
+def _level(seconds: float) -> Segment:
+    return Segment("straight and level", seconds)
+
+
 _BANK = math.radians(30.0)
+_STEEP = math.radians(45.0)
 
 PLANS: dict[str, Plan] = {
     plan.name: plan
@@ -184,6 +238,68 @@ PLANS: dict[str, Plan] = {
                 Segment("recover", 16.0),
                 Segment("rudder doublet", 10.0, input=doublet("rudder", amplitude=0.2), test_point="TP 3"),
                 Segment("recover", 14.0),
+            ],
+        ),
+        _plan("3-2-1-1", [_level(5.0), _pitch(10.0, "TP 1"), _level(10.0)]),
+        _plan("doublets", [_level(5.0), _roll(7.0, "TP 1"), _level(6.0), _yaw(8.0, "TP 2"), _level(9.0)]),
+        _plan("bank-to-bank", [_level(5.0), *bank_to_bank("TP 1"), _level(8.0)]),
+        _plan("push-pull", [_level(5.0), push_pull("TP 1"), _level(14.0)]),
+        _plan("wind-up-turn", [_level(5.0), wind_up_turn(test_point="TP 1"), _level(11.0)]),
+        _plan(
+            "calibration",
+            [
+                _level(4.0),
+                _pitch(),
+                _roll(),
+                _yaw(),
+                *bank_to_bank(),
+                push_pull(),
+                _level(6.0),
+                wind_up_turn(36.0),
+                _level(8.0),
+            ],
+        ),
+        _plan(
+            "straight",
+            [
+                _level(5.0),
+                _pitch(11.0),
+                _roll(8.0),
+                _yaw(9.0),
+                *bank_to_bank(),
+                push_pull(),
+                _level(10.0),
+                _pitch(11.0),
+                _yaw(9.0),
+                _level(9.0),
+            ],
+        ),
+        _plan(
+            "turn-record",
+            [
+                _level(5.0),
+                push_pull(),
+                _level(8.0),
+                Segment("level turn right", 40.0, bank=_STEEP),
+                Segment("level turn left", 26.0, bank=-_STEEP),
+                Segment("roll out", 10.0),
+            ],
+        ),
+        _plan(
+            "points",
+            [
+                _level(8.0),
+                _pitch(12.0, "TP 1"),
+                _level(8.0),
+                _roll(8.0, "TP 2"),
+                _yaw(9.0, "TP 2"),
+                _level(8.0),
+                *bank_to_bank("TP 3"),
+                _level(9.0),
+                push_pull("TP 4"),
+                _level(12.0),
+                wind_up_turn(36.0, test_point="TP 5"),
+                _level(12.0),
             ],
         ),
     )

@@ -1,13 +1,14 @@
 """The truth: what the simulated aircraft really did, at the record rate.
 
-Earth: rotating WGS-84; altitude is geodetic height, which stands for height above mean sea level because no geoid is
-modelled. Frames: NED for the Earth, FRD for the body. Angles rad, everything SI.
+Earth: rotating WGS-84, or flat (`sims.earth`); altitude is geodetic height, which stands for height above mean sea
+level because no geoid is modelled. Frames: NED for the Earth, FRD for the body. Angles rad, everything SI.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +43,8 @@ UNITS: dict[str, str] = {
 class Truth:
     """Columns over N records; `UNITS` says what each one is.
 
-    Vectors are (N, 3), `controls` is (N, 4), all others (N,).
+    Vectors are (N, 3), `controls` is (N, 4), all others (N,). `planet` is "wgs84" or "flat", `aircraft` the JSBSim
+    model that flew.
     """
 
     t: Times
@@ -63,6 +65,8 @@ class Truth:
     temperature: Array
     controls: Array
     segment: Times
+    planet: str = "wgs84"
+    aircraft: str = ""
 
     def __len__(self) -> int:
         """Return the number of records N."""
@@ -78,11 +82,13 @@ class Truth:
         """Records per second (Hz)."""
         return 1e9 / float(self.t[1] - self.t[0])
 
-    def save(self, path: str | Path) -> None:
-        """Write all columns and their units to a compressed .npz."""
+    def save(self, path: str | Path, **more: str) -> None:
+        """Write all columns, their units and `more` texts to a compressed .npz."""
         columns = {name: getattr(self, name) for name in UNITS}
+        texts = {name: np.array(text) for name, text in more.items()}
+        who = {"planet": np.array(self.planet), "aircraft": np.array(self.aircraft)}
         units = np.array([f"{name}: {unit}" for name, unit in UNITS.items()])
-        np.savez_compressed(path, allow_pickle=False, **columns, units=units)
+        np.savez_compressed(path, allow_pickle=False, **columns, **who, **texts, units=units)
 
     @classmethod
     def load(cls, path: str | Path) -> Truth:
@@ -97,4 +103,5 @@ class Truth:
             missing = [name for name in UNITS if name not in file]
             if missing:
                 raise ValueError(f"{path} is not a truth record: no column {', '.join(missing)}")
-            return cls(**{name: file[name] for name in UNITS})
+            who: dict[str, Any] = {name: str(file[name]) for name in ("planet", "aircraft") if name in file}
+            return cls(**{name: file[name] for name in UNITS}, **who)

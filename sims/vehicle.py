@@ -15,11 +15,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sims.sensors import VERTICAL
 from sims.transmitter import send, write_tlog
+from sims.vocabulary import SATELLITES
 
 if TYPE_CHECKING:
     from sims.faults import Frame
     from sims.flight import Flight
     from sims.sensors import Fixes
+    from sims.truth import Array, Times
 
 __all__ = ["frames", "send", "write_tlog"]
 
@@ -30,14 +32,22 @@ FIXED_WING = mavlink.MAV_TYPE_FIXED_WING
 
 IMU_FIELDS = 0b000_111_111
 """HIGHRES_IMU.fields_updated: accelerometers (bits 0..2) and gyros (3..5). The magnetometer (6..8) does not exist."""
-AIR_FIELDS = 0b1111 << 9
-"""HIGHRES_IMU.fields_updated: static pressure, differential pressure, pressure altitude, temperature (9..12)."""
+STATIC_FIELDS = 0b1101 << 9
+"""HIGHRES_IMU.fields_updated: static pressure, pressure altitude, temperature (9, 11, 12)."""
+PITOT_FIELDS = 1 << 10
+"""HIGHRES_IMU.fields_updated: differential pressure."""
 
 KELVIN = 273.15
 
 DILUTION = (80, 120)
 """GPS_RAW_INT.eph and epv: dilution of precision x 100."""
-SATELLITES = 14
+
+GPS_EPOCH = 315_964_800
+"""Unix time of the GPS epoch (s)."""
+LEAP_SECONDS = 18
+"""GPS time minus UTC since 2017 (s)."""
+WEEK = 604_800_000
+"""A GPS week (ms)."""
 
 _Stream = Iterator[tuple[int, Any]]
 
@@ -63,9 +73,11 @@ def frames(flight: Flight, *, sysid: int = 1) -> Iterator[Frame]:
 
     Notes
     -----
-    HIGHRES_IMU 50 Hz; ATTITUDE 25; SCALED_PRESSURE 10; GPS_RAW_INT, GLOBAL_POSITION_INT and VFR_HUD 5; HEARTBEAT and
-    SYSTEM_TIME 1; STATUSTEXT at boot and for every mark. Pressures are float32 hPa on the wire: 0.006 Pa, half a
-    millimetre of height.
+    HIGHRES_IMU at the rate of the IMU; ATTITUDE, SCALED_PRESSURE, AOA_SSA and GPS_RAW_INT at those of their sensors;
+    GPS_INPUT beside GPS_RAW_INT where the receiver reports three components of velocity, which the latter cannot carry;
+    GLOBAL_POSITION_INT and VFR_HUD 5 Hz; HEARTBEAT and SYSTEM_TIME 1; STATUSTEXT at boot and for every mark. Pressures
+    are float32 hPa on the wire: 0.006 Pa, half a millimetre of height. An angle that is not measured is NaN in
+    ATTITUDE.
     """
     if not 1 <= sysid <= 255:
         raise ValueError(f"a MAVLink system number is 1..255, not {sysid}")
@@ -74,7 +86,9 @@ def frames(flight: Flight, *, sysid: int = 1) -> Iterator[Frame]:
 
 def _frames(flight: Flight, sysid: int) -> Iterator[Frame]:
     packer = mavlink.MAVLink(None, srcSystem=sysid, srcComponent=AUTOPILOT)
-    streams = (_heartbeat, _system_time, _text, _imu, _attitude, _pressure, _gnss, _position, _hud)
+    streams = (
+        _heartbeat, _system_time, _text, _imu, _attitude, _pressure, _vanes, _gnss_input, _gnss, _position, _hud,
+    )  # fmt: skip
     # Each stream is in time order; at the same instant they speak in the order above, because the merge is stable.
     for t, message in heapq.merge(*(stream(flight) for stream in streams), key=lambda item: item[0]):
         frame = bytes(message.pack(packer))
@@ -111,18 +125,33 @@ def _text(flight: Flight) -> _Stream:
 
 def _imu(flight: Flight) -> _Stream:
     imu, static, pitot = flight.sensors.imu, flight.sensors.static, flight.sensors.pitot
-    columns = (static.pressure / 100.0, pitot.impact / 100.0, static.altitude, static.temperature - KELVIN)
-    air = np.stack(columns, axis=1).tolist()
     magnetometer = (0.0, 0.0, 0.0)
-    latest, following = air[0], 0
+    # Air data come more rarely. In between the last values stay in place with their bits unset.
+    absolute = _Latest(static.t, static.pressure / 100.0, static.altitude, static.temperature - KELVIN)
+    differential = _Latest(pitot.t, pitot.impact / 100.0)
     for t, force, rates in zip(imu.t.tolist(), imu.specific_force.tolist(), imu.rates.tolist(), strict=True):
-        fields = IMU_FIELDS
-        # Air data come at a fifth of the rate. In between the last values stay in place with their bits unset.
-        if following < len(air) and static.t[following] <= t:
-            latest = air[following]
-            fields |= AIR_FIELDS
-            following += 1
-        yield t, mavlink.MAVLink_highres_imu_message(t // 1000, *force, *rates, *magnetometer, *latest, fields)
+        (pressure, altitude, temperature), (impact,) = absolute.at(t), differential.at(t)
+        fields = IMU_FIELDS | (STATIC_FIELDS if absolute.fresh else 0) | (PITOT_FIELDS if differential.fresh else 0)
+        air = (pressure, impact, altitude, temperature)
+        yield t, mavlink.MAVLink_highres_imu_message(t // 1000, *force, *rates, *magnetometer, *air, fields)
+
+
+class _Latest:
+    """The latest row of columns at times that only grow; zeros before the first."""
+
+    def __init__(self, t: Times, *columns: Array) -> None:
+        self._t = t.tolist()
+        self._rows = np.stack(columns, axis=1).tolist()
+        self._next = 0
+        self._row = [0.0] * len(columns)
+        self.fresh = False
+
+    def at(self, t: int) -> list[float]:
+        self.fresh = False
+        while self._next < len(self._t) and self._t[self._next] <= t:
+            self._row, self.fresh = self._rows[self._next], True
+            self._next += 1
+        return self._row
 
 
 def _attitude(flight: Flight) -> _Stream:
@@ -135,9 +164,35 @@ def _attitude(flight: Flight) -> _Stream:
 
 def _pressure(flight: Flight) -> _Stream:
     static, pitot = flight.sensors.static, flight.sensors.pitot
-    columns = (static.t, static.pressure / 100.0, pitot.impact / 100.0, (static.temperature - KELVIN) * 100.0)
+    columns = (static.t, static.pressure / 100.0, _hold(pitot.t, pitot.impact, static.t) / 100.0,
+               (static.temperature - KELVIN) * 100.0)  # fmt: skip
     for t, absolute, differential, centi in zip(*(column.tolist() for column in columns), strict=True):
         yield t, mavlink.MAVLink_scaled_pressure_message(t // 1_000_000, absolute, differential, round(centi))
+
+
+def _vanes(flight: Flight) -> _Stream:
+    vanes = flight.sensors.vanes
+    columns = (vanes.t, np.degrees(vanes.alpha), np.degrees(vanes.beta))
+    for t, alpha, beta in zip(*(column.tolist() for column in columns), strict=True):
+        yield t, mavlink.MAVLink_aoa_ssa_message(t // 1000, alpha, beta)
+
+
+def _gnss_input(flight: Flight) -> _Stream:
+    grade, first = flight.sensors.grade, int(flight.truth.t[0])
+    if not grade.gnss_down:
+        return
+    dilution = [value / 100.0 for value in DILUTION]
+    accuracy = (grade.velocity, grade.position, grade.position * VERTICAL)
+    for t, latitude, longitude, altitude, *velocity in _rows(flight.sensors.gnss):
+        week, ms = divmod((flight.start_utc + t - first) // 1_000_000 - (GPS_EPOCH - LEAP_SECONDS) * 1000, WEEK)
+        where = (_degrees7(latitude), _degrees7(longitude), altitude)
+        fix = (ms, week, mavlink.GPS_FIX_TYPE_3D_FIX)
+        yield (
+            t,
+            mavlink.MAVLink_gps_input_message(
+                t // 1000, 0, 0, *fix, *where, *dilution, *velocity, *accuracy, SATELLITES
+            ),
+        )
 
 
 def _gnss(flight: Flight) -> _Stream:
@@ -180,7 +235,7 @@ def _position(flight: Flight) -> _Stream:
 
 def _hud(flight: Flight) -> _Stream:
     navigation, pitot = flight.sensors.navigation, flight.sensors.pitot
-    airspeed = pitot.airspeed[np.searchsorted(pitot.t, navigation.t, side="right") - 1].tolist()
+    airspeed = _hold(pitot.t, pitot.airspeed, navigation.t).tolist()
     throttle = np.interp(navigation.t, flight.truth.t, flight.truth.controls[:, 3]).tolist()
     rows = zip(_rows(navigation), airspeed, throttle, _heading(flight, navigation), strict=True)
     for (t, _, _, altitude, north, east, down), speed, lever, psi in rows:
@@ -189,10 +244,15 @@ def _hud(flight: Flight) -> _Stream:
 
 
 def _heading(flight: Flight, fixes: Fixes) -> list[float]:
-    """Return the latest measured heading (rad) at the times of `fixes`."""
+    """Return the latest measured heading (rad) at the times of `fixes`; 0 before the first."""
     reference = flight.sensors.attitude
-    index = np.searchsorted(reference.t, fixes.t, side="right") - 1
-    return [float(psi) for psi in reference.attitude[index, 2]]
+    measured = np.isfinite(reference.attitude[:, 2])
+    return [float(psi) for psi in _hold(reference.t[measured], reference.attitude[measured, 2], fixes.t)]
+
+
+def _hold(t: Times, values: Array, at: Times) -> Array:
+    """Return the latest of `values` at the times `at`; 0 before the first."""
+    return np.concatenate([[0.0], values])[np.searchsorted(t, at, side="right")]
 
 
 def _rows(fixes: Fixes) -> Iterator[tuple[Any, ...]]:

@@ -135,10 +135,12 @@ def test_wrong_words_are_answered_with_the_right_ones():
         sims.fly("c310")
     with pytest.raises(PlanError, match=r"unknown plan 'loop'.*demo"):
         sims.fly(plan="loop")
-    with pytest.raises(ValueError, match=r"unknown sensors 'gold'.*fti, mems"):
+    with pytest.raises(ValueError, match=r"unknown sensors 'gold'.*fti, mems, mems-vanes"):
         sims.fly(sensors="gold")
     with pytest.raises(PlanError, match="positive number of seconds"):
         sims.fly(duration=0)
+    with pytest.raises(AircraftError, match="unknown planet 'disc'; known: wgs84, flat"):
+        sims.fly(planet="disc")
     with pytest.raises(PlanError, match="must divide 400"):
         sims.fly(record_rate=60)
     with pytest.raises(AircraftError, match="does not trim at 1000 m and 10 m/s"):

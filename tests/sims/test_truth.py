@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sims.sensors import ECCENTRICITY2, EQUATOR
+from sims.earth import ECCENTRICITY2, EQUATOR
 from sims.truth import UNITS, Truth
 
 EARTH_RATE = 7.292115e-5

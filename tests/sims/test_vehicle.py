@@ -153,6 +153,57 @@ def test_hud(flight, decoded):
     assert np.all((column(messages, "heading") >= 0) & (column(messages, "heading") < 360))
 
 
+def test_the_small_autopilot_sends_neither_vanes_nor_vertical_velocity(decoded):
+    assert "AOA_SSA" not in decoded
+    assert "GPS_INPUT" not in decoded
+
+
+@pytest.fixture(scope="module")
+def instrumented():
+    """A short flight with flight-test instrumentation, and its messages."""
+    flown = sims.fly("737", "level", sensors="fti", duration=5, start_utc=UTC)
+    parser = mavlink.MAVLink(None)
+    messages = collections.defaultdict(list)
+    for t, frame in sims.frames(flown):
+        message = parser.decode(bytearray(frame))
+        messages[message.get_type()].append((t, message))
+    return flown, messages
+
+
+def test_vanes_are_degrees(instrumented):
+    flown, messages = instrumented
+    vanes, told = flown.sensors.vanes, messages["AOA_SSA"]
+    np.testing.assert_array_equal(times(told), vanes.t)
+    np.testing.assert_array_equal(column(told, "time_usec") * 1000, vanes.t)
+    np.testing.assert_allclose(column(told, "AOA"), np.degrees(vanes.alpha), rtol=1e-6)
+    np.testing.assert_allclose(column(told, "SSA"), np.degrees(vanes.beta), rtol=1e-6, atol=1e-6)
+
+
+def test_a_fix_with_three_components_of_velocity(instrumented):
+    flown, messages = instrumented
+    gnss, told = flown.sensors.gnss, messages["GPS_INPUT"]
+    assert len(told) == len(messages["GPS_RAW_INT"])
+    velocity = np.stack([column(told, name) for name in ("vn", "ve", "vd")], axis=1)
+    np.testing.assert_allclose(velocity, gnss.velocity, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(column(told, "lat"), np.degrees(gnss.latitude) * 1e7, atol=0.51)
+    np.testing.assert_allclose(column(told, "alt"), gnss.altitude, rtol=1e-6)
+    first = told[0][1]
+    assert (first.fix_type, first.ignore_flags, first.satellites_visible) == (3, 0, 14)
+    accuracy = (first.speed_accuracy, first.horiz_accuracy, first.vert_accuracy)
+    np.testing.assert_allclose(accuracy, [0.05, 2, 3], rtol=1e-6)
+    gps = UTC / 1e9 - 315964800 + 18
+    assert first.time_week == int(gps // 604800)
+    assert first.time_week_ms == round(gps % 604800 * 1000)
+
+
+def test_flight_test_rates_on_the_link(instrumented):
+    _, messages = instrumented
+    for name, rate in (("HIGHRES_IMU", 100), ("ATTITUDE", 50), ("SCALED_PRESSURE", 20), ("AOA_SSA", 50)):
+        assert set(np.diff(times(messages[name]))) == {1_000_000_000 // rate}
+    fresh = [m.fields_updated >> 9 for _, m in messages["HIGHRES_IMU"]]
+    assert fresh[:6] == [0b1111, 0, 0, 0, 0, 0b1111]
+
+
 def test_several_vehicles_have_numbers_of_their_own(flight):
     assert {frame[5] for _, frame in sims.frames(flight, sysid=7)} == {7}
     for number in (0, 256):
