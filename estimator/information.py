@@ -133,7 +133,7 @@ def start(
             raise ValueError("p0 is not finite (only a variance that is correlated with nothing may be infinite)")
         regular = bool(known.all())
         if known.any():
-            factor, weight = _information(block)
+            factor, weight = factored(block)
             index = np.flatnonzero(known)
             ut[np.ix_(index, records + index)] = factor.T
             ut[index, :records] = factor.T @ mean[:, known].T
@@ -145,7 +145,7 @@ def start(
     return _carry(ut, d, np.zeros(records, dtype), np.eye(n, dtype=dtype), 0, regular)
 
 
-def _information(p0: Array) -> tuple[Array, Array]:
+def factored(p0: Array) -> tuple[Array, Array]:
     """U and D of P_0^{-1}: P_0 = C C^T, and C^{-T} is already upper triangular."""
     if not np.allclose(p0, p0.T, rtol=1e-9, atol=0.0):
         raise ValueError("p0 is not symmetric")

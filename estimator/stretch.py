@@ -1,0 +1,253 @@
+"""One stretch of flight: filtered as it comes, smoothed from any closed step on, iterated when it is over.
+
+Steps stand in blocks, each beginning with an anchor. A block holds what drove it and the carry it began with, and as
+long as there is room the snapshots; those of an older block are made again when they are wanted, to the same bits. So
+memory grows by the inputs alone, whatever the length of the flight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator import extended
+from estimator.extended import About, Carry, Drive, Rows, Told
+from estimator.models.flight_path import FlightPath
+from estimator.rotation import difference
+
+Floats = NDArray[np.float64]
+
+BLOCK = 2000  # steps
+KEPT = 8  # blocks whose snapshots stay in memory
+WINDOW = 100  # steps between anchors
+
+
+class Filtered(NamedTuple):
+    """What the filter says of N steps.
+
+    Attributes
+    ----------
+    mean, std (N, n) : named states; std is NaN where none was wanted
+    innovation (N, 10), status (N, 10), doubted (N,) : as `extended.Told`
+    """
+
+    mean: Floats
+    std: Floats
+    innovation: Floats
+    status: NDArray[np.uint8]
+    doubted: NDArray[np.uint8]
+
+
+class Smoothed(NamedTuple):
+    """What the smoother says of N + 1 epochs.
+
+    Attributes
+    ----------
+    mean, std (N+1, n) : named states; std is NaN where none was wanted
+    x (N+1, 23), q (N+1, 4), w (N, 6) : the trajectory to linearise about, and the noise of the inertial sensors
+    """
+
+    mean: Floats
+    std: Floats
+    x: Floats
+    q: Floats
+    w: Floats
+
+
+class Diverged(ArithmeticError):
+    """The filter's result is no longer finite; ``step`` says where."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+        super().__init__("the flight path is no longer finite")
+
+
+@dataclass(slots=True)
+class _Block:
+    begin: Carry
+    drives: list[Drive] = field(default_factory=list)
+    tolds: list[Told] = field(default_factory=list)
+    rows: Rows | None = None
+    count: int = 0
+
+    def drive(self) -> Drive:
+        if len(self.drives) > 1:
+            self.drives = [Drive.join(self.drives)]
+        return self.drives[0]
+
+    def told(self) -> Told:
+        if len(self.tolds) > 1:
+            self.tolds = [Told.join(self.tolds)]
+        return self.tolds[0]
+
+
+class Stretch:
+    """A stretch of flight.
+
+    Parameters
+    ----------
+    flight : FlightPath
+    carry : Carry
+        From `FlightPath.start`.
+    window : int
+        Steps between anchors; the result does not depend on it.
+    gated : bool
+        Whether improbable measurements are weakened and refused.
+    """
+
+    def __init__(self, flight: FlightPath, carry: Carry, *, window: int = WINDOW, gated: bool = True) -> None:
+        self.flight, self._window, self._gated = flight, window, gated
+        self.carry = carry
+        self._blocks: list[_Block] = []
+
+    def __len__(self) -> int:
+        return sum(block.count for block in self._blocks)
+
+    def advance(self, drive: Drive) -> Filtered:
+        """Filter steps.
+
+        Raises
+        ------
+        Diverged
+            A result is not finite; the stretch ends before that step.
+        """
+        parts = []
+        first, total = 0, len(drive.dt)
+        while first < total:
+            if not self._blocks or self._blocks[-1].count >= BLOCK:
+                self._begin()
+            block = self._blocks[-1]
+            stop = min(total, first + BLOCK - block.count)
+            parts.append(self._filter(block, drive.part(first, stop), first))
+            first = stop
+        return parts[0] if len(parts) == 1 else Filtered(*(np.concatenate(c) for c in zip(*parts, strict=True)))
+
+    def _begin(self) -> None:
+        """Begin a block at the present epoch."""
+        self._anchor(self.carry)
+        if self._blocks and (rows := self._blocks[-1].rows) is not None:
+            rows.closed[self._blocks[-1].count - 1] = 1
+        self._blocks.append(_Block(self.carry.copy(), rows=Rows.empty(BLOCK, self.flight.n, self.flight.p)))
+        for old in self._blocks[-KEPT - 1 :: -1]:
+            if old.rows is None:
+                break
+            old.rows = None
+
+    def _anchor(self, carry: Carry) -> None:
+        if carry.clock[2] > 0:
+            extended.anchor(
+                self.flight.model, carry, np.empty((7, 7)), np.empty(7, np.int64), carry.x[self.flight.model.order]
+            )
+
+    def _filter(self, block: _Block, drive: Drive, first: int) -> Filtered:
+        count, n = len(drive.dt), self.flight.n
+        told = Told.empty(count, n)
+        assert block.rows is not None
+        rows = block.rows.part(block.count, block.count + count)
+        wrong = extended.forward(
+            self.flight.model, drive, About.nothing(), self._window, self._gated, self.carry, True, rows, told
+        )
+        if wrong >= 0:
+            raise Diverged(first + wrong)
+        block.drives.append(drive)
+        block.tolds.append(told)
+        block.count += count
+        mean = np.empty((count, n))
+        extended.named(self.flight.model, rows.x, rows.q, True, mean)
+        return Filtered(mean, told.std, told.innovation, told.status, told.doubted)
+
+    def smooth(self, *, std: bool = True) -> Smoothed:
+        """Smooth everything from the first block on, given what is known now."""
+        blocks = [block for block in self._blocks if block.count]
+        return self._backward(blocks, self.carry, None, std)
+
+    def hybrid(self, found: Smoothed, *, std: bool = True) -> Smoothed:
+        """One more pass, linearised about a smoothed trajectory, gusts and wind about their own prediction."""
+        blocks = [block for block in self._blocks if block.count]
+        n = self.flight.n
+        carry = blocks[0].begin.copy()
+        turned = np.empty(3)
+        difference(found.q[0], carry.q, turned)
+        carry.s[n - 3 :] = turned
+        carry.q[:] = found.q[0]
+        again, first = [], 0
+        for block in blocks:
+            self._anchor(carry)
+            again.append(_Block(carry.copy(), [block.drive()], [block.told()], None, block.count))
+            about = self._about(found, block, first)
+            rows = Rows.empty(block.count, n, self.flight.p) if len(blocks) <= KEPT else None
+            self._forward(again[-1], carry, about, rows, hidden=True)
+            again[-1].rows = rows
+            first += block.count
+        for block in again[:-1]:
+            if block.rows is not None:
+                block.rows.closed[block.count - 1] = 1
+        return self._backward(again, carry, found, std)
+
+    def _about(self, found: Smoothed, block: _Block, first: int) -> About:
+        stop = first + block.count
+        told = block.told()
+        return About(found.x[first : stop + 1], found.q[first : stop + 1], found.w[first:stop], told.status, told.r)
+
+    def _forward(self, block: _Block, carry: Carry, about: About, rows: Rows | None, *, hidden: bool) -> None:
+        drive, n = block.drive(), self.flight.n
+        if hidden:
+            drive = drive._replace(shown=np.zeros(block.count, np.uint8))
+        keep = rows is not None
+        room = rows if rows is not None else Rows.empty(block.count, n, self.flight.p)
+        wrong = extended.forward(
+            self.flight.model, drive, about, self._window, self._gated, carry, keep, room, Told.empty(block.count, n)
+        )
+        if wrong >= 0:
+            raise Diverged(wrong)
+
+    def _backward(self, blocks: list[_Block], carry: Carry, about: Smoothed | None, factors: bool) -> Smoothed:
+        n, total = self.flight.n, sum(block.count for block in blocks)
+        x, q, w = np.empty((total + 1, 23)), np.empty((total + 1, 4)), np.empty((total, 6))
+        std = np.full((total + 1, n), np.nan)
+        star, vt, d = np.empty((n, 1)), np.empty((n, n)), np.empty(n)
+        last = carry.copy()
+        if blocks[-1].rows is not None and blocks[-1].rows.closed[blocks[-1].count - 1]:
+            self._anchor(last)
+        extended.finish(last, star, vt, d, factors)
+        stop = total
+        for i in range(len(blocks) - 1, -1, -1):
+            block = blocks[i]
+            first = stop - block.count
+            rows = block.rows
+            if rows is None:
+                rows = Rows.empty(block.count, n, self.flight.p)
+                nothing = About.nothing() if about is None else self._about(about, block, first)
+                self._forward(block, block.begin.copy(), nothing, rows, hidden=True)
+                if i < len(blocks) - 1:
+                    rows.closed[-1] = 1
+            shown = np.concatenate([[0], block.drive().shown]).astype(np.uint8)
+            if i == 0:
+                shown[0] = 1
+            extended.backward(
+                self.flight.model, rows.part(0, block.count), star, vt, d, shown, factors, block.begin.s,
+                block.begin.q, block.begin.x, x[first : stop + 1], q[first : stop + 1], w[first:stop],
+                std[first : stop + 1],
+            )  # fmt: skip
+            stop = first
+        mean = np.empty((total + 1, n))
+        extended.named(self.flight.model, x, q, False, mean)
+        return Smoothed(mean, std, x, q, w)
+
+    def drop(self) -> None:
+        """Forget the steps: what is smoothed next begins at the present epoch."""
+        self._blocks = []
+
+    def cut(self, first: int, stop: int) -> tuple[Drive, Told]:
+        """What drove the steps first..stop-1, and what was told of them."""
+        drives, tolds, at = [], [], 0
+        for block in self._blocks:
+            a, b = max(first - at, 0), min(stop - at, block.count)
+            if a < b:
+                drives.append(block.drive().part(a, b))
+                tolds.append(block.told().part(a, b))
+            at += block.count
+        return Drive.join(drives), Told.join(tolds)
