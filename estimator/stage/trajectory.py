@@ -1,139 +1,33 @@
-"""The stage: samples to estimates and windows.
-
-The only file of the room that knows the vocabulary. Per vehicle and boot epoch it orders the samples, filters them as
-they become complete, closes windows, and smooths what has closed. Nothing crosses a boot: a new epoch begins from the
-prior. So does a new leg of the same epoch, where the clock stepped, a silence or a distance was too long, or the filter
-failed.
-"""
+"""A leg of the trajectory: position and velocity from satellite fixes and altimeter, as long as one filter flies it."""
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.arrivals import Arrivals, Place
 from estimator.information import Carry, anchor, filter, start
 from estimator.model import LinearModel
 from estimator.models import trajectory
 from estimator.models.trajectory import Trajectory
 from estimator.smoother import backward
 from estimator.snapshots import Store
-from estimator.synchronise import MARK, Rows, Steps, Synchroniser, concatenate, take
+from estimator.stage.rows import ALTITUDE, FIX_VELOCITY, GNSS, HEIGHT_COLUMN, SENSORS
+from estimator.stage.settings import STAGE, Reason
+from estimator.synchronise import MARK, Rows, Steps, Synchroniser, take
 from estimator.window import Rule
-from telemetry.messages import Altitude, Estimate, Event, Gnss, Mark, Message, Progress, Window, event
+from telemetry.messages import Estimate, Event, Message, Window
 
-SENSORS = ("gnss", "altitude")
-GNSS, ALTITUDE = range(len(SENSORS))
-STAGE = "estimate"
-Seconds = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
-Scope = Literal["window", "sortie"]
-Level = Literal["info", "warning", "error"]
-Reason = Literal["mark", "gap", "length", "reboot", "end"]
+if TYPE_CHECKING:
+    from estimator.stage.epoch import Epoch
 
-
-class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How samples become estimates.
-
-    Parameters
-    ----------
-    lag : float
-        How long a sample waits for older ones, s: the delay of the live estimate.
-    grid : float
-        Longest step without a measurement, s.
-    gap : float
-        A silence longer than this closes the window, s.
-    window : float
-        Longest window between test points, s, from its first measurement; a silence is never cut by it.
-    test_point : float
-        Longest window of a test point, s; one that lasts longer is cut there and goes on under the same name.
-    trajectory : estimator.models.trajectory.Settings
-    """
-
-    lag: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.3
-    grid: Seconds = 0.5
-    gap: Seconds = 3.0
-    window: Seconds = 30.0
-    test_point: Seconds = 600.0
-    trajectory: trajectory.Settings = trajectory.Settings()
-
-
-def estimate(
-    messages: Iterable[Message], settings: Settings | None = None, *, scope: Scope = "window"
-) -> Iterator[Message]:
-    """Estimate the state of every vehicle.
-
-    Parameters
-    ----------
-    messages : iterable of Message
-        The output of `telemetry.ingest.ingest`.
-    settings : Settings, optional
-    scope : {"window", "sortie"}
-        What a window's smoothing knows: everything up to its closing, told when it closes; or the whole leg, in
-        general the boot epoch, told when that ends.
-
-    Yields
-    ------
-    Estimate, Window, Event, Progress
-        The estimates do not depend on `scope`, nor does anything on how the input was cut into batches.
-    """
-    settings = settings or Settings()
-    vehicles: dict[int, dict[int, _Epoch]] = {}
-    for message in _ended(messages):
-        if isinstance(message, Gnss | Altitude | Mark):
-            epochs = vehicles.setdefault(message.vehicle, {})
-            if message.boot not in epochs:
-                epochs[message.boot] = _Epoch(message.vehicle, message.boot, settings, scope)
-            epochs[message.boot].take(message)
-        elif isinstance(message, Progress):
-            until = int(message.t_rx[-1])
-            for _, epochs in sorted(vehicles.items()):
-                for boot in sorted(epochs):
-                    over = any(other > boot and epochs[other].heard <= until for other in epochs)
-                    if over or message.final:
-                        yield from epochs.pop(boot).finish(until, "reboot" if over else "end")
-                    else:
-                        yield from epochs[boot].advance(until)
-            yield Progress(vehicle=0, source=STAGE, boot=0, t=message.t, t_rx=message.t_rx, final=message.final)
-
-
-def _ended(messages: Iterable[Message]) -> Iterator[Message]:
-    """The messages, with a final word where they break off without one: what has been covered is then the end."""
-    last: Progress | None = None
-    for message in messages:
-        if isinstance(message, Progress):
-            last = message
-        yield message
-    if last is not None and not last.final:
-        yield msgspec.structs.replace(last, final=True)
-
-
-def warm_up() -> None:
-    """Compile the stage by running it on a few samples, so that the first real ones do not wait for it."""
-    t = 200_000_000 * np.arange(1, 41)
-    common: dict[str, Any] = {"vehicle": 1, "source": "0/1", "boot": 0, "t": t, "t_rx": t}
-    ones = np.ones(len(t))
-    samples: list[Message] = [
-        Gnss(
-            **common,
-            latitude=ones,
-            longitude=ones,
-            altitude=ones,
-            velocity=np.zeros((len(t), 3)),
-            sigma=np.ones((len(t), 3)),
-            satellites=np.full(len(t), 9),
-        ),
-        Altitude(**common, altitude=ones, pressure=ones, sigma=ones),
-        Progress(vehicle=0, source="", boot=0, t=t[-1:], t_rx=t[-1:], final=True),
-    ]
-    for _ in estimate(samples, Settings(window=3.0)):
-        pass
+USED = SENSORS[:2]
 
 
 @dataclass(slots=True)
@@ -145,7 +39,7 @@ class _Open:
     begin: int | None = None  # time of its first measurement
     t: list[NDArray[np.int64]] = field(default_factory=list)
     t_rx: list[NDArray[np.int64]] = field(default_factory=list)
-    used: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(SENSORS), np.int64))
+    used: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(USED), np.int64))
     nis: float = 0.0
     dof: int = 0
     anchors: int = 0
@@ -154,124 +48,19 @@ class _Open:
         return sum(len(t) for t in self.t)
 
 
-class _Epoch:
-    """One boot epoch of one vehicle: its arrivals, and the leg that is being flown."""
-
-    def __init__(self, vehicle: int, boot: int, settings: Settings, scope: Scope) -> None:
-        self.heard = np.iinfo(np.int64).max  # receive time of the first message
-        self.vehicle, self.boot, self.settings, self.scope = vehicle, boot, settings, scope
-        self._lag = round(settings.lag * 1e9)
-        self._arrivals = Arrivals(SENSORS, GNSS, lag=self._lag)
-        self.marks: list[tuple[str, str]] = []  # action and name
-        self._leg: _Leg | None = None
-        self._number, self._test_point = 0, ""  # of the next leg's first window
-        self._begun = False
-        self._samples, self._t, self._t_rx = 0, np.iinfo(np.int64).min, np.iinfo(np.int64).min
-
-    def take(self, message: Message) -> None:
-        """Take a message in; nothing happens before its receive time has been covered."""
-        self.heard = min(self.heard, int(message.t_rx.min()))
-        self._samples += len(message.t)
-        self._t, self._t_rx = max(self._t, int(message.t.max())), max(self._t_rx, int(message.t_rx.max()))
-        k = len(message.t)
-        z, r = np.full((k, trajectory.M), np.nan), np.ones((k, trajectory.M))
-        if isinstance(message, Mark):
-            sensor = MARK
-            z[:, 0] = len(self.marks) + np.arange(k)
-            self.marks += zip(message.action, message.name, strict=True)
-        elif isinstance(message, Gnss):
-            sensor = GNSS
-            z[:, :3] = np.stack([message.latitude, message.longitude, message.altitude], axis=1)
-            z[:, 3:6] = message.velocity
-            r[:, :3] = message.sigma
-        else:
-            assert isinstance(message, Altitude)
-            sensor = ALTITUDE
-            z[:, 0], r[:, 0] = message.altitude, message.sigma
-        self._arrivals.push(Rows(message.t, message.t_rx, np.full(k, sensor), z, r))
-
-    def advance(self, until: int, end: Reason | None = None) -> Iterator[Message]:
-        """Filter what is complete, and tell the windows that close on the way."""
-        rows = self._arrivals.covered(until)
-        while rows is not None and len(rows.t):
-            piece = self._arrivals.judge(rows, end is not None)
-            rows = piece.rest
-            failed = len(piece.judged.t)  # nowhere
-            if piece.origin is not None:
-                self._leg = self._begin(piece.origin)
-                fix = int(np.flatnonzero(piece.rows.sensor == GNSS)[0])
-                yield self.event(
-                    "info",
-                    f"trajectory model from satellite fixes and altimeter, origin "
-                    f"{np.rad2deg(piece.origin[0]):.5f} {np.rad2deg(piece.origin[1]):.5f} deg, "
-                    f"{piece.origin[2]:.0f} m",
-                    int(piece.rows.t[fix]),
-                    int(piece.rows.t_rx[fix]),
-                )
-            if self._leg is not None:
-                try:
-                    yield from self._leg.advance(piece.rows, until)
-                    if piece.over:
-                        yield from self._end(self._leg, "gap", until)
-                except (ValueError, ArithmeticError) as error:
-                    failed = piece.row(self._leg.at + self._lag)
-                    yield from self._fail(self._leg, error)
-                    rows = concatenate([take(piece.judged, np.arange(failed + 1, len(piece.judged.t))), rows])
-            for note in piece.notes:
-                if note.row <= failed:  # what came after is judged anew
-                    yield self.event("warning", note.text, note.t, note.t_rx)
-
-    def finish(self, until: int, reason: Reason) -> Iterator[Message]:
-        """Let everything out and close the last window."""
-        yield from self.advance(until, reason)
-        if self._leg is not None:
-            try:
-                yield from self._end(self._leg, reason, until)
-            except (ValueError, ArithmeticError) as error:
-                assert self._leg is not None
-                yield from self._fail(self._leg, error)
-        if not self._begun:
-            text = f"no satellite fix in boot {self.boot}: nothing to estimate from {self._samples} samples"
-            yield self.event("warning", text, self._t, self._t_rx)
-
-    def _begin(self, origin: Place) -> _Leg:
-        self._begun = True
-        model = Trajectory(*origin, self.settings.trajectory)
-        return _Leg(self, model, self._number, self._test_point)
-
-    def _end(self, leg: _Leg, reason: Reason, until: int) -> Iterator[Message]:
-        yield from leg.finish(reason, until)
-        self._leg, self._number, self._test_point = None, leg.number, leg.test_point
-
-    def _fail(self, leg: _Leg, error: Exception) -> Iterator[Message]:
-        """Tell of an error, and what is left of the leg; the next fix begins another."""
-        self._arrivals.forget()
-        text = f"the estimate of vehicle {self.vehicle}, boot {self.boot} failed and begins anew: {error}"
-        yield self.event("error", text, leg.at, leg.at_rx)
-        try:
-            yield from leg.close("gap", leg.at)  # what was late after that counts in the next leg
-            yield from leg.smooth()
-        except (ValueError, ArithmeticError):
-            pass  # told already: the window is lost
-        self._leg, self._number, self._test_point = None, leg.number, leg.test_point
-
-    def event(self, level: Level, text: str, t: int, t_rx: int) -> Event:
-        return event(text, level=level, vehicle=self.vehicle, source=STAGE, boot=self.boot, t=t, t_rx=t_rx)
-
-
-class _Leg:
+class Leg:
     """A stretch of an epoch that one filter flies.
 
     `number` and `test_point` are those of the window being flown, `at` and `at_rx` the times of the step at hand.
     """
 
-    def __init__(self, epoch: _Epoch, model: Trajectory, number: int, test_point: str) -> None:
+    def __init__(self, epoch: Epoch, model: Trajectory, number: int, test_point: str) -> None:
         self._epoch, self._model = epoch, model
         self.number = number
         self.at = self.at_rx = 0
         settings = self._settings = epoch.settings
         self._synchroniser = Synchroniser(
-            len(SENSORS), trajectory.M, lag=round(settings.lag * 1e9), grid=round(settings.grid * 1e9)
+            len(USED), trajectory.M, lag=round(settings.lag * 1e9), grid=round(settings.grid * 1e9)
         )
         self._marks: list[tuple[str, str]] = []
         self._late: list[tuple[int, int]] = []
@@ -286,6 +75,7 @@ class _Leg:
 
     @property
     def test_point(self) -> str:
+        """Name of the test point under way, "" for none."""
         return self._window.test_point
 
     def advance(self, rows: Rows, until: int) -> Iterator[Message]:
@@ -296,9 +86,9 @@ class _Leg:
             self._synchroniser.mark(int(t), int(t_rx))
             self._marks.append(self._epoch.marks[int(number)])
         fixes, heights = take(rows, rows.sensor == GNSS), take(rows, rows.sensor == ALTITUDE)
-        z, r = model.gnss(fixes.z[:, 0], fixes.z[:, 1], fixes.z[:, 2], fixes.z[:, 3:6], fixes.r[:, :3])
+        z, r = model.gnss(fixes.z[:, 0], fixes.z[:, 1], fixes.z[:, 2], fixes.z[:, FIX_VELOCITY], fixes.r[:, :3])
         self._synchroniser.push(fixes._replace(z=z, r=r))
-        z, r = model.altimeter(heights.z[:, 0], heights.r[:, 0])
+        z, r = model.altimeter(heights.z[:, HEIGHT_COLUMN], heights.r[:, HEIGHT_COLUMN])
         self._synchroniser.push(heights._replace(z=z, r=r))
         yield from self._release(until, False)
 
@@ -443,7 +233,7 @@ class _Leg:
         window = self._window
         if not len(window):
             return
-        late = Counter(SENSORS[sensor] for t, sensor in self._late if t <= when)
+        late = Counter(USED[sensor] for t, sensor in self._late if t <= when)
         self._late = [item for item in self._late if item[0] > when]
         closed = self._message(window, reason, dict(late))
         if self._epoch.scope == "window":
@@ -476,7 +266,7 @@ class _Leg:
             test_point=window.test_point,
             reason=reason,
             scope=self._epoch.scope,
-            measurements=dict(zip(SENSORS, window.used.tolist(), strict=True)),
+            measurements=dict(zip(USED, window.used.tolist(), strict=True)),
             late=late,
             anchors=window.anchors,
             nis=window.nis,

@@ -1,0 +1,105 @@
+"""The stage: samples to estimates and windows.
+
+The only part of the room that knows the vocabulary. Per vehicle and boot epoch it orders the samples, filters them as
+they become complete, closes windows, and smooths what has closed. Nothing crosses a boot: a new epoch begins from the
+prior. So does a new leg of the same epoch, where the clock stepped, a silence or a distance was too long, or the filter
+failed.
+
+Two models fly side by side: the trajectory, which any telemetry with satellite fixes allows, and the flight path, which
+needs inertial sensors at 20 Hz or more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from estimator.stage.epoch import TAKEN, Epoch
+from estimator.stage.settings import STAGE, Scope, Settings
+from telemetry.messages import AirData, Altitude, Attitude, FlowAngles, Gnss, Imu, Message, Progress
+
+__all__ = ["STAGE", "Scope", "Settings", "estimate", "warm_up"]
+
+
+def estimate(
+    messages: Iterable[Message], settings: Settings | None = None, *, scope: Scope = "window"
+) -> Iterator[Message]:
+    """Estimate the state of every vehicle.
+
+    Parameters
+    ----------
+    messages : iterable of Message
+        The output of `telemetry.ingest.ingest`.
+    settings : Settings, optional
+    scope : {"window", "sortie"}
+        What a window's smoothing knows: everything up to its closing, told when it closes; or the whole leg, in
+        general the boot epoch, told when that ends.
+
+    Yields
+    ------
+    Estimate, Window, Event, Progress
+        The estimates do not depend on `scope`, nor does anything on how the input was cut into batches.
+    """
+    settings = settings or Settings()
+    vehicles: dict[int, dict[int, Epoch]] = {}
+    for message in _ended(messages):
+        if isinstance(message, TAKEN):
+            epochs = vehicles.setdefault(message.vehicle, {})
+            if message.boot not in epochs:
+                epochs[message.boot] = Epoch(message.vehicle, message.boot, settings, scope)
+            epochs[message.boot].take(message)
+        elif isinstance(message, Progress):
+            until = int(message.t_rx[-1])
+            for _, epochs in sorted(vehicles.items()):
+                for boot in sorted(epochs):
+                    over = any(other > boot and epochs[other].heard <= until for other in epochs)
+                    if over or message.final:
+                        yield from epochs.pop(boot).finish(until, "reboot" if over else "end")
+                    else:
+                        yield from epochs[boot].advance(until)
+            yield Progress(vehicle=0, source=STAGE, boot=0, t=message.t, t_rx=message.t_rx, final=message.final)
+
+
+def _ended(messages: Iterable[Message]) -> Iterator[Message]:
+    """The messages, with a final word where they break off without one: what has been covered is then the end."""
+    last: Progress | None = None
+    for message in messages:
+        if isinstance(message, Progress):
+            last = message
+        yield message
+    if last is not None and not last.final:
+        yield msgspec.structs.replace(last, final=True)
+
+
+def warm_up() -> None:
+    """Compile the stage by running it on a few samples, so that the first real ones do not wait for it."""
+
+    def times(hertz: int) -> dict[str, Any]:
+        t = 1_000_000_000 // hertz * np.arange(1, 8 * hertz + 1)
+        return {"vehicle": 1, "source": "0/1", "boot": 0, "t": t, "t_rx": t}
+
+    slow, fast = np.ones(40), np.ones(160)
+    level = np.tile([0.0, 0.0, -9.81], (160, 1))
+    samples: list[Message] = [
+        Gnss(
+            **times(5),
+            latitude=slow,
+            longitude=slow,
+            altitude=slow,
+            velocity=np.tile([30.0, 0.0, 0.0], (40, 1)),
+            sigma=np.ones((40, 3)),
+            satellites=np.full(40, 9),
+        ),
+        Altitude(**times(5), altitude=slow, pressure=101325.0 * slow, sigma=slow),
+        Imu(**times(20), specific_force=level, angular_rate=np.zeros((160, 3))),
+        Attitude(**times(20), phi=0.0 * fast, theta=0.0 * fast, psi=0.0 * fast),
+        AirData(**times(5), airspeed=30.0 * slow, differential_pressure=np.nan * slow),
+        FlowAngles(**times(5), alpha=0.0 * slow, beta=0.0 * slow),
+        Progress(vehicle=0, source="", boot=0, t=slow[-1:].astype(np.int64), t_rx=np.array([1 << 40]), final=True),
+    ]
+    for scope in ("window", "sortie"):
+        for _ in estimate(samples, Settings(window=3.0), scope=scope):
+            pass

@@ -1,0 +1,312 @@
+"""The flight path of one leg: looked for until it can begin, flown in stretches, told in windows and reports.
+
+A stretch begins when the sensors allow an alignment and ends with a silence of the inertial sensors, when roll is no
+longer known, or when the filter fails; the next one begins as soon as it can. Windows close at marks, after their
+length, and with the stretch. Over a whole sortie a stretch is smoothed when it ends, once as the filter linearised it
+and then about the smoothed trajectory.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Generator, Iterator
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+
+from estimator import alignment
+from estimator.arrivals import Place
+from estimator.drive import LONGEST_GAP, MEASURED, WIDTH, Driver, Samples, Steps
+from estimator.models.flight_path import FlightPath
+from estimator.stage.examining import Examiner
+from estimator.stage.passage import Closed, Passage
+from estimator.stage.report import Sum, test_point_report
+from estimator.stage.rows import AIR, GNSS, SENSORS
+from estimator.stage.settings import Reason
+from estimator.stretch import Diverged, Smoothed, Stretch
+from estimator.synchronise import MARK, Rows, Synchroniser, take
+from telemetry.messages import Message
+
+if TYPE_CHECKING:
+    from estimator.stage.epoch import Epoch
+
+S = 1_000_000_000
+TRY = S // 2  # ns between two attempts to begin
+PATIENCE = 5 * S  # ns of vain attempts before the reason is told
+UNKNOWN_ROLL = math.radians(60.0)
+DOUBTS = 6  # times that one stretch may be doubted
+
+
+class Flight:
+    """The flight path beside one leg of the trajectory.
+
+    Parameters
+    ----------
+    epoch : Epoch
+    origin : (float, float, float)
+        Latitude, longitude (rad), altitude (m).
+    test_point : str
+        Under way when the leg begins; "" for none.
+    """
+
+    def __init__(self, epoch: Epoch, origin: Place, test_point: str) -> None:
+        self.epoch, self.origin = epoch, origin
+        self.settings = epoch.settings.flight_path
+        self.test_point = test_point
+        self._marks: list[tuple[str, str]] = []
+        self._buffer: list[Rows] = []
+        self._whole = epoch.scope == "sortie"
+        self.examiner = Examiner(self.settings)
+        self._delay: float | None = self.settings.gnss_delay
+        self._synchroniser = self._synchronise(self._delay or 0.0)
+        self._recent: list[Samples] = []
+        self._tried = -(1 << 62)
+        self._since: int | None = None
+        self._told: set[str] = set()
+        self._passage: Passage | None = None
+        self.sum = Sum()
+
+    def _synchronise(self, delay: float) -> Synchroniser:
+        self.delay = delay
+        wait = self.epoch.settings.lag + max(delay, self.settings.air_delay, 0.0)
+        return Synchroniser(len(SENSORS), WIDTH, lag=round(wait * 1e9), grid=1 << 60)
+
+    # -- samples in ----------------------------------------------------------------------------------------------------
+
+    def advance(self, samples: Rows, until: int) -> Iterator[Message]:
+        """Take what was believed; the flight goes on as far as it is complete."""
+        if self._whole and self._delay is None:  # the delay of the fixes first
+            self._buffer.append(samples)
+            return
+        self._push(samples)
+        yield from self._release(until, False)
+
+    def finish(self, reason: Reason, until: int) -> Iterator[Message]:
+        """Let everything out and close the last window."""
+        if self._buffer:
+            yield from self._replay(until)
+        yield from self._release(until, True)
+        yield from self._land(reason)
+        if self.sum.flight is not None:
+            yield self.sum.report(self)
+
+    def _replay(self, until: int) -> Iterator[Message]:
+        """Find the delay of the satellite fixes in everything there is, then fly."""
+        for samples in self._buffer:
+            self.examiner.take(samples)
+        self._synchroniser = self._synchronise(self.examiner.delay())
+        for samples in self._buffer:
+            self._push(samples, seen=True)
+        self._buffer = []
+        yield from self._release(until, False)
+
+    def _push(self, samples: Rows, *, seen: bool = False) -> None:
+        if not seen:
+            self.examiner.take(samples)
+        marks = take(samples, samples.sensor == MARK)
+        for t, t_rx, number in zip(marks.t, marks.t_rx, marks.z[:, 0], strict=True):
+            self._synchroniser.mark(int(t), int(t_rx))
+            self._marks.append(self.epoch.marks[int(number)])
+        rest = take(samples, samples.sensor != MARK)
+        z, t = rest.z, rest.t
+        fixes = rest.sensor == GNSS
+        if fixes.any():
+            z = z.copy()
+            z[fixes, :3] = np.nan  # the place: not a specific force
+        shift = np.where(fixes, round(self.delay * 1e9), 0)
+        shift[rest.sensor == AIR] = round(self.settings.air_delay * 1e9)
+        self._synchroniser.push(rest._replace(t=t - shift, z=z))
+
+    def _release(self, until: int, final: bool) -> Iterator[Message]:
+        steps = self._synchroniser.release(until, final)
+        samples = Samples(steps.t, steps.t_rx, steps.z, steps.r)
+        late = [t for t, sensor in steps.late]
+        if self._passage is not None:
+            self._passage.late += len(late)
+        marks = list(steps.marks)
+        first = 0
+        while first < len(samples.t) or marks:
+            stop = int(np.searchsorted(samples.t, marks[0][0], "right")) if marks else len(samples.t)
+            stop = max(stop, first)
+            yield from self._walk(samples.rows(slice(first, stop)))
+            first = stop
+            if marks:
+                when, number = marks.pop(0)
+                yield from self._mark(when, *self._marks[number])
+
+    def _mark(self, when: int, action: str, name: str) -> Iterator[Message]:
+        if (action == "stop") != (self.test_point == name):
+            return  # stopped without having been started, or said twice: the trajectory tells it
+        if self._passage is not None:
+            yield from self._close("mark")
+        self.test_point = name if action == "start" else ""
+        if self._passage is not None:
+            self._passage.open(self.test_point, when)
+
+    # -- beginning -----------------------------------------------------------------------------------------------------
+
+    def _walk(self, samples: Samples) -> Iterator[Message]:
+        while len(samples.t):
+            if self._passage is None:
+                samples = yield from self._look(samples)
+            if self._passage is not None and len(samples.t):
+                samples = yield from self._fly(samples)
+
+    def _look(self, samples: Samples) -> Generator[Message, None, Samples]:
+        """Try to begin, twice a second; gives back the samples after the beginning."""
+        slot = samples.t // TRY
+        first = slot != np.concatenate([[self._tried], slot[:-1]])
+        self._tried = int(slot[-1])
+        for i in np.flatnonzero(first).tolist():
+            recent = self._lately(samples.rows(slice(i + 1)), 1)
+            found = self._begin(recent)
+            if isinstance(found, str):
+                yield from self._explain(found, recent)
+                continue
+            now = recent.rows(slice(found.row + 1, None))  # after the inertial sample of the beginning
+            flight, begin = self._model(recent), recent.rows(slice(found.row + 1))
+            yield from self._take_off(flight, begin, found)
+            self._recent = []
+            return Samples.join([now, samples.rows(slice(i + 1, None))])
+        self._recent = [self._lately(samples, 2)]
+        return Samples.none()
+
+    def _lately(self, samples: Samples, spans: int) -> Samples:
+        """The samples, and those before them that an alignment looks at."""
+        recent = Samples.join([*self._recent, samples])
+        first = np.searchsorted(recent.t, recent.t[-1] - spans * round(alignment.SPAN * 1e9))
+        return recent.rows(slice(int(first), None))
+
+    def _model(self, recent: Samples) -> FlightPath:
+        settings = self.settings
+        if settings.mode == "auto":
+            air = bool(np.isfinite(recent.z[:, MEASURED]).any())
+            settings = msgspec.structs.replace(settings, mode="G" if air else "I")
+        return FlightPath.of(settings, self.origin[0], self.origin[2])
+
+    def _begin(self, recent: Samples) -> alignment.Start | str:
+        if self._since is None:
+            self._since = int(recent.t[-1])
+        return alignment.find(recent, self._model(recent), alignment.true_airspeed(recent))
+
+    def _explain(self, reason: str, recent: Samples) -> Iterator[Message]:
+        """Say why there is no flight path, once for each reason."""
+        assert self._since is not None
+        key = re.sub(r"[-\d.]+", "", reason)
+        if recent.t[-1] - self._since < PATIENCE or key in self._told:
+            return
+        self._told.add(key)
+        level = "warning" if self.epoch.settings.model == "flight_path" else "info"
+        yield self.epoch.event(
+            "warning" if level == "warning" else "info",
+            f"no flight path yet, the trajectory model goes on alone: {reason}",
+            int(recent.t[-1]),
+            int(recent.t_rx[-1]),
+        )
+
+    def _take_off(self, flight: FlightPath, begin: Samples, found: alignment.Start) -> Iterator[Message]:
+        t = int(begin.t[-1])
+        stretch = Stretch(flight, flight.start(found.values, found.sigma))
+        driver = Driver(
+            flight, t, begin.z[-1, :6].copy(), found.period, output=round(self.epoch.settings.output * 1e9),
+            attitude_interval=round(flight.settings.attitude_interval * 1e9),
+        )  # fmt: skip
+        self._passage = Passage(self, flight, stretch, driver, t, int(begin.t_rx[-1]))
+        self._passage.open(self.test_point, t)
+        self._told.clear()
+        yield self.epoch.event(
+            "info",
+            f"flight path, mode {flight.settings.mode}, {flight.n} states: inertial samples at "
+            f"{1 / found.period:.1f} Hz, {found.text}, satellite fixes taken as {self.delay:.2f} s old",
+            t,
+            int(begin.t_rx[-1]),
+        )
+
+    # -- flying --------------------------------------------------------------------------------------------------------
+
+    def _fly(self, samples: Samples) -> Generator[Message, None, Samples]:
+        """Filter the samples, closing windows by their length; gives back those after the end of the stretch."""
+        passage = self._passage
+        assert passage is not None
+        settings = self.epoch.settings
+        longest = round((settings.test_point if self.test_point else settings.window) * 1e9)
+        stop = int(np.searchsorted(samples.t, passage.begin + longest, "right"))
+        over = stop < len(samples.t)
+        steps = passage.driver.push(samples.rows(slice(stop)))
+        rest = samples.rows(slice(stop, None))
+        if steps is not None:
+            bad = yield from self._filter(passage, steps)
+            if bad is not None:
+                yield from self._end(passage, bad)
+                return rest
+        if passage.driver.gap is not None:
+            remains = Samples.join([passage.driver.rest(), rest])
+            yield from self._end(passage, f"more than {LONGEST_GAP:.0f} s without inertial samples")
+            return remains
+        if over:
+            yield from self._close("length")
+            passage.open(self.test_point, passage.begin + longest)
+        return rest
+
+    def _filter(self, passage: Passage, steps: Steps) -> Generator[Message, None, str | None]:
+        """Filter steps and tell the estimates; gives back why the stretch ends, if it does."""
+        try:
+            filtered = passage.stretch.advance(steps.drive)
+        except Diverged as error:
+            return str(error)
+        message = passage.account(steps, filtered)
+        if message is not None:
+            yield message
+        yield from passage.events(steps, filtered)
+        shown = steps.drive.shown == 1
+        if passage.doubts >= DOUBTS:
+            return f"measurements contradicted the filter {DOUBTS} times"
+        roll = passage.flight.names.index("phi")
+        level = np.abs(filtered.mean[shown, 4]) < math.radians(80.0)
+        if (filtered.std[shown, roll][level] > UNKNOWN_ROLL).any():
+            return "roll is no longer known to 60 deg"
+        return None
+
+    def _end(self, passage: Passage, why: str) -> Iterator[Message]:
+        """End the stretch; the next one begins when it can."""
+        at, at_rx = passage.last
+        yield self.epoch.event("warning", f"the flight path ends and begins anew: {why}", at, at_rx)
+        yield from self._land("gap")
+
+    def _close(self, reason: Reason) -> Iterator[Message]:
+        """Close the window of the stretch."""
+        passage = self._passage
+        assert passage is not None
+        closed = passage.close(reason)
+        if closed is None:
+            return
+        yield from passage.refused(closed)
+        if self._whole:
+            return
+        smoothed = passage.stretch.smooth()
+        yield from self._tell(passage, [closed], smoothed)
+        passage.forget()
+
+    def _land(self, reason: Reason) -> Iterator[Message]:
+        """Close the last window and, over a whole sortie, smooth the stretch."""
+        passage = self._passage
+        if passage is None:
+            return
+        self._since = None
+        yield from self._close(reason)
+        if self._whole and passage.closed:
+            smoothed = passage.stretch.smooth(std=self.epoch.settings.iterate == 0)
+            for i in range(self.epoch.settings.iterate):
+                last = i == self.epoch.settings.iterate - 1
+                smoothed = passage.stretch.hybrid(smoothed, std=last)
+            yield from self._tell(passage, passage.closed, smoothed)
+        self._passage = None
+
+    def _tell(self, passage: Passage, closed: list[Closed], smoothed: Smoothed) -> Iterator[Message]:
+        for window in closed:
+            self.sum.add(passage, window, smoothed)
+            yield passage.message(window, smoothed)
+            if window.test_point:
+                yield test_point_report(self, passage, window, smoothed)

@@ -1,0 +1,238 @@
+"""One stretch of the flight path as the stage tells it: estimates as they come, windows as they close."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.consistency import Tally
+from estimator.drive import Driver, Steps
+from estimator.extended import REJECTED
+from estimator.kinematics import MEASUREMENTS, M
+from estimator.models.flight_path import MODEL, FlightPath
+from estimator.stage.rows import SENSORS
+from estimator.stage.settings import STAGE, Reason
+from estimator.stretch import Filtered, Smoothed, Stretch
+from estimator.ud import compiled
+from telemetry.messages import Estimate, Event, Window
+
+if TYPE_CHECKING:
+    from estimator.stage.flight import Flight
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+SENSOR_OF = ("air_data", "flow_angles", "flow_angles", *("attitude",) * 3, "altitude", *("gnss",) * 3)
+FIRST_OF = (0, 1, 3, 6, 7)  # one channel of each sensor, by which its samples are counted
+DOUBTED = {1: "velocity", 2: "attitude", 4: "turbulence"}
+
+
+@compiled
+def _sums(square: Floats, used: Times, shown: NDArray[np.uint8], left: Floats, nis: Floats, dof: Times) -> None:
+    """Sum the squares since the last shown row, in order, so that cuts do not matter; ``left`` carries the rest."""
+    k = 0
+    for i in range(square.size):
+        left[0] += square[i]
+        left[1] += used[i]
+        if shown[i]:
+            nis[k] = left[0]
+            dof[k] = np.int64(left[1])
+            left[0] = 0.0
+            left[1] = 0.0
+            k += 1
+
+
+@dataclass(slots=True)
+class Closed:
+    """A window of the flight path, open or closed.
+
+    `first` and `stop` are its steps in the stretch, `at` the epochs that are told.
+    """
+
+    number: int
+    test_point: str
+    begin: int
+    first: int
+    digest: Any
+    stop: int = 0
+    reason: Reason = "end"
+    t: list[Times] = field(default_factory=list)
+    t_rx: list[Times] = field(default_factory=list)
+    at: list[Times] = field(default_factory=list)
+    std: list[Floats] = field(default_factory=list)
+    tallies: list[Tally] = field(default_factory=lambda: [Tally() for _ in range(M)])
+    used: dict[str, int] = field(default_factory=lambda: dict.fromkeys(SENSORS, 0))
+    nis: float = 0.0
+    dof: int = 0
+    bridged: float = 0.0
+    anchors: int = 0
+    late: int = 0
+    span: tuple[int, int] = (0, 0)
+
+
+class Passage:
+    """The windows of one stretch.
+
+    Parameters
+    ----------
+    flight : Flight
+        The leg it belongs to.
+    model : FlightPath
+    stretch, driver
+    t, t_rx : int
+        Of its beginning, ns.
+    """
+
+    def __init__(
+        self, flight: Flight, model: FlightPath, stretch: Stretch, driver: Driver, t: int, t_rx: int,
+    ) -> None:  # fmt: skip
+        self._leg, self.flight, self.stretch, self.driver = flight, model, stretch, driver
+        self.last = (t, t_rx)
+        self.begin = t
+        self.doubts = 0
+        self.late = 0
+        self.closed: list[Closed] = []
+        self._left = np.zeros(2)
+        self._steps = 0  # since the stretch was last forgotten
+        self._configuration = msgspec.json.encode(flight.epoch.settings)
+        self._window: Closed | None = None
+
+    def open(self, test_point: str, begin: int) -> None:
+        """Begin a window."""
+        self.begin = begin
+        self._window = Closed(
+            self._leg.epoch.flown, test_point, self.last[0], self._steps, hashlib.sha256(self._configuration)
+        )
+
+    def account(self, steps: Steps, filtered: Filtered) -> Estimate | None:
+        """Take filtered steps into the window, and make a message of those that are told."""
+        window, drive = self._window, steps.drive
+        assert window is not None
+        status = filtered.status
+        used = (status != 0) & (status != REJECTED)
+        square = np.where(used, np.square(filtered.innovation), 0.0).sum(axis=1)
+        shown = np.flatnonzero(drive.shown)
+        nis, dof = np.empty(len(shown)), np.empty(len(shown), np.int64)
+        _sums(square, used.sum(axis=1), drive.shown, self._left, nis, dof)
+        for channel, tally in enumerate(window.tallies):
+            tally.add(filtered.innovation[:, channel], status[:, channel].astype(np.int64))
+        for channel in FIRST_OF:
+            window.used[SENSOR_OF[channel]] += int((status[:, channel] != 0).sum())
+        window.used["imu"] += int(steps.inertial.sum())
+        for value in nis.tolist():
+            window.nis += value
+        window.dof += int(dof.sum())
+        for seconds in drive.dt[drive.bridged == 1].tolist():
+            window.bridged += seconds
+        window.digest.update(np.column_stack([steps.t.view(np.float64), drive.u, drive.z, drive.r]).tobytes())
+        window.t.append(steps.t[shown])
+        window.t_rx.append(steps.t_rx[shown])
+        window.at.append(self._steps + shown + 1)
+        window.std.append(filtered.std[shown])
+        self._steps += len(steps.t)
+        self.last = (int(steps.t[-1]), int(steps.t_rx[-1]))
+        if not len(shown):
+            return None
+        epoch = self._leg.epoch
+        return Estimate(
+            vehicle=epoch.vehicle,
+            source=STAGE,
+            boot=epoch.boot,
+            t=steps.t[shown],
+            t_rx=steps.t_rx[shown],
+            model=MODEL,
+            names=self.flight.names,
+            units=self.flight.units,
+            mean=filtered.mean[shown],
+            std=filtered.std[shown],
+            nis=nis,
+            dof=dof,
+            geodetic=np.full((len(shown), 3), np.nan),
+        )
+
+    def events(self, steps: Steps, filtered: Filtered) -> Iterator[Event]:
+        """What a reader of the log should know of these steps."""
+        epoch = self._leg.epoch
+        bridged = steps.drive.bridged == 1
+        if bridged.any():
+            ends = np.flatnonzero(bridged & steps.inertial)
+            for i in ends.tolist():
+                begin = i
+                while begin > 0 and bridged[begin - 1] and not steps.inertial[begin - 1]:
+                    begin -= 1
+                seconds = float(steps.drive.dt[begin : i + 1].sum())
+                text = (
+                    f"{seconds:.2f} s without inertial samples: interpolated, with the variance of unknown manoeuvring"
+                )
+                yield epoch.event("warning", text, int(steps.t[i]), int(steps.t_rx[i]))
+        for i in np.flatnonzero(filtered.doubted).tolist():
+            self.doubts += 1
+            names = [DOUBTED[bit] for bit in DOUBTED if filtered.doubted[i] & bit]
+            refused = [MEASUREMENTS[c] for c in np.flatnonzero(filtered.status[i] == REJECTED)]
+            text = (
+                f"{', '.join(refused)} refused too often to be wrong: {' and '.join(names)} of the filter doubted, "
+                "its variance taken ten times"
+            )
+            yield epoch.event("warning", text, int(steps.t[i]), int(steps.t_rx[i]))
+
+    def refused(self, window: Closed) -> Iterator[Event]:
+        """What the gate did in a window."""
+        for name, tally in zip(MEASUREMENTS, window.tallies, strict=True):
+            if tally.rejected or tally.weakened:
+                text = (
+                    f"{name}: of {tally.used + tally.rejected} measurements {tally.rejected} refused "
+                    f"(beyond 8 sigmas), {tally.weakened} weakened (beyond 5)"
+                )
+                yield self._leg.epoch.event("info", text, *self.last)
+
+    def close(self, reason: Reason) -> Closed | None:
+        """Close the window; None where it holds nothing."""
+        window, self._window = self._window, None
+        if window is None or not any(len(t) for t in window.t):
+            return None
+        window.stop, window.reason = self._steps, reason
+        window.late, self.late = self.late, 0
+        window.number = self._leg.epoch.flown
+        self._leg.epoch.flown += 1
+        self.closed.append(window)
+        return window
+
+    def forget(self) -> None:
+        """Let go of what has been told."""
+        self.stretch.drop()
+        self._steps = 0
+        self.closed = []
+
+    def message(self, window: Closed, smoothed: Smoothed) -> Window:
+        """The window as it is told."""
+        epoch = self._leg.epoch
+        at, t = np.concatenate(window.at), np.concatenate(window.t)
+        return Window(
+            vehicle=epoch.vehicle,
+            source=STAGE,
+            boot=epoch.boot,
+            t=t,
+            t_rx=np.concatenate(window.t_rx),
+            model=MODEL,
+            names=self.flight.names,
+            units=self.flight.units,
+            mean=smoothed.mean[at],
+            std=smoothed.std[at],
+            geodetic=np.full((len(t), 3), np.nan),
+            number=window.number,
+            test_point=window.test_point,
+            reason=window.reason,
+            scope=epoch.scope,
+            measurements=window.used,
+            late={"all": window.late} if window.late else {},
+            anchors=0,
+            nis=window.nis,
+            dof=window.dof,
+            digest=window.digest.hexdigest(),
+        )

@@ -1,0 +1,201 @@
+"""Reports: what a test point or a whole sortie is worth, in numbers with verdicts."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator import consistency
+from estimator.consistency import Tally
+from estimator.extended import REJECTED
+from estimator.kinematics import MEASUREMENTS
+from estimator.models.flight_path import CALM, MODEL, PARAMETERS, FlightPath
+from estimator.stage.settings import STAGE
+from estimator.stretch import Smoothed, Stretch
+from telemetry.messages import Channel, Parameter, Report, Spread
+
+if TYPE_CHECKING:
+    from estimator.stage.flight import Flight
+    from estimator.stage.passage import Closed, Passage
+
+Floats = NDArray[np.float64]
+
+UNITS = ("m/s", "rad", "rad", "rad", "rad", "rad", "m", "m/s", "m/s", "m/s")
+OPTIMISTIC = 2.0  # the airspeed scale in turbulence is stated with so many times its sigma: the aircraft answers gusts
+
+
+def alone(passage: Passage, window: Closed, smoothed: Smoothed) -> tuple[Floats, Floats]:
+    """Mean and standard deviation of all states at the end of a window from what was measured in it alone.
+
+    Begun where the smoothed path passes, with the priors of a first start and what the gate decided on the way.
+    """
+    drive, told = passage.stretch.cut(window.first, window.stop)
+    refused = told.status == REJECTED
+    shown = np.zeros(len(drive.dt), np.uint8)
+    shown[-1] = 1
+    drive = drive._replace(z=np.where(refused, np.nan, drive.z), r=told.r, shown=shown)
+    flight = passage.flight
+    values = {
+        name: float(value)
+        for name, value in zip(flight.names, smoothed.mean[window.first], strict=True)
+        if name not in PARAMETERS
+    }
+    again = Stretch(flight, flight.start(values), gated=False)
+    filtered = again.advance(drive)
+    return filtered.mean[-1], filtered.std[-1]
+
+
+def parameters(
+    flight: FlightPath, mean: Floats, std: Floats, others: dict[str, list[tuple[float, float]]]
+) -> tuple[Parameter, ...]:
+    """Judge every parameter of the model."""
+    prior = flight.prior()
+    gusts = flight.settings.turbulence >= CALM
+    out = []
+    for i, (name, unit) in enumerate(zip(flight.names, flight.units, strict=True)):
+        if name in PARAMETERS:
+            factor = OPTIMISTIC if gusts and name == "k_airspeed" else 1.0
+            found = consistency.parameter(float(mean[i]), float(std[i]), float(prior[i]), others.get(name, ()), factor)
+            out.append(Parameter(name=name, unit=unit, prior=float(prior[i]), **found._asdict()))
+    return tuple(out)
+
+
+def channels(tallies: Sequence[Tally]) -> tuple[Channel, ...]:
+    """Judge every measured quantity."""
+    out = []
+    for i, tally in enumerate(tallies):
+        if tally.used or tally.rejected:
+            judged = consistency.judge(tally, air_data=i < 3)
+            out.append(
+                Channel(
+                    name=MEASUREMENTS[i], unit=UNITS[i], used=tally.used, weakened=tally.weakened,
+                    rejected=tally.rejected, **judged._asdict(),
+                )
+            )  # fmt: skip
+    return tuple(out)
+
+
+def alarms(told: Sequence[Channel]) -> tuple[str, ...]:
+    """What makes the error bars untrustworthy."""
+    return tuple(
+        f"over-confident about {channel.name}: {channel.why}" for channel in told if channel.verdict == "over-confident"
+    )
+
+
+def spreads(flight: FlightPath, filtered: Floats, smoothed: Floats) -> tuple[Spread, ...]:
+    """Medians of the standard deviations (n,) by state; None where there is none."""
+    return tuple(
+        Spread(name=name, unit=unit, filtered=_finite(before), smoothed=_finite(after))
+        for name, unit, before, after in zip(flight.names, flight.units, filtered, smoothed, strict=True)
+    )
+
+
+def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: Smoothed) -> Report:
+    """Report a closed window that is a test point."""
+    flight, epoch = passage.flight, leg.epoch
+    at, t = np.concatenate(window.at), np.concatenate(window.t)
+    mean, std = alone(passage, window, smoothed)
+    found = parameters(flight, mean, std, epoch.found)
+    for parameter in found:
+        if parameter.value is not None and parameter.sigma is not None:
+            epoch.found.setdefault(parameter.name, []).append((parameter.value, parameter.sigma))
+    told = channels(window.tallies)
+    raw = leg.examiner.findings(int(t[0]), int(t[-1]), leg.delay)
+    return Report(
+        vehicle=epoch.vehicle,
+        source=STAGE,
+        boot=epoch.boot,
+        t=t[-1:],
+        t_rx=window.t_rx[-1][-1:],
+        model=MODEL,
+        test_point=window.test_point,
+        scope="test point",
+        window=window.number,
+        begin=int(t[0]),
+        states=spreads(flight, np.median(np.concatenate(window.std), axis=0), np.median(smoothed.std[at], axis=0)),
+        parameters=found,
+        channels=told,
+        gaps={"interpolated": window.bridged} if window.bridged else {},
+        loss=leg.examiner.loss(int(t[0]), int(t[-1])),
+        loss_effect={},
+        findings=tuple(finding.text for finding in raw),
+        alarms=alarms(told),
+        digest=window.digest.hexdigest(),
+    )
+
+
+class Sum:
+    """What the windows of a leg add up to."""
+
+    def __init__(self) -> None:
+        self.flight: FlightPath | None = None
+        self.tallies: list[Tally] = []
+        self.filtered: list[Floats] = []
+        self.smoothed: list[Floats] = []
+        self.mean = self.std = np.empty(0)
+        self.begin = 0
+        self.end = (0, 0)
+        self.number = 0
+        self.bridged = 0.0
+        self.lost = 0.0
+        self._digest = hashlib.sha256()
+
+    def add(self, passage: Passage, window: Closed, smoothed: Smoothed) -> None:
+        """Take a window."""
+        at = np.concatenate(window.at)
+        if self.flight is None or self.flight.names != passage.flight.names:
+            self.flight, self.filtered, self.smoothed = passage.flight, [], []
+        if not self.tallies:
+            self.begin = int(window.t[0][0])
+        first = not self.tallies
+        self.tallies = (
+            list(window.tallies) if first else [a + b for a, b in zip(self.tallies, window.tallies, strict=True)]
+        )
+        self.filtered.append(np.median(np.concatenate(window.std), axis=0))
+        self.smoothed.append(np.median(smoothed.std[at], axis=0))
+        self.mean, self.std = smoothed.mean[at[-1]], smoothed.std[at[-1]]
+        self.end = self.last(window)
+        self.number = window.number
+        self.bridged += window.bridged
+        self._digest.update(window.digest.digest())
+
+    @staticmethod
+    def last(window: Closed) -> tuple[int, int]:
+        """Times of the last epoch of a window."""
+        t, t_rx = np.concatenate(window.t), np.concatenate(window.t_rx)
+        return int(t[-1]), int(t_rx[-1])
+
+    def report(self, leg: Flight) -> Report:
+        """Report the whole leg."""
+        assert self.flight is not None
+        told = channels(self.tallies)
+        gaps = {"interpolated": self.bridged, "lost": self.lost}
+        return Report(
+            vehicle=leg.epoch.vehicle,
+            source=STAGE,
+            boot=leg.epoch.boot,
+            t=np.array([self.end[0]]),
+            t_rx=np.array([self.end[1]]),
+            model=MODEL,
+            test_point="",
+            scope="sortie",
+            window=self.number,
+            begin=self.begin,
+            states=spreads(self.flight, np.median(self.filtered, axis=0), np.median(self.smoothed, axis=0)),
+            parameters=parameters(self.flight, self.mean, self.std, {}),
+            channels=told,
+            gaps={name: seconds for name, seconds in gaps.items() if seconds},
+            loss=leg.examiner.loss(-(1 << 62), 1 << 62),
+            loss_effect={},
+            findings=tuple(f.text for f in leg.examiner.findings(-(1 << 62), 1 << 62, leg.delay)),
+            alarms=alarms(told),
+            digest=self._digest.hexdigest(),
+        )
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
