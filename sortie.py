@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from wiring import (
     DISTRIBUTION,
@@ -184,7 +184,36 @@ def record(folder: Path, *, sortie: str, connect: str = BUS) -> None:
         subscription.close()
 
 
-def smooth(log: Path, *, output: Path | None = None, config: Path | None = None, quiet: bool = False) -> None:
+def mark(action: Literal["start", "stop"], name: str, *, to: str = "udpout:127.0.0.1:14550", vehicle: int = 0) -> None:
+    """Mark the start or stop of a test point from the ground while sortie live follows the flight.
+
+    The mark is a STATUSTEXT of a ground station: it is kept in the raw log like everything else that arrives.
+
+    Parameters
+    ----------
+    action
+        start or stop.
+    name
+        Name of the test point.
+    to
+        Where sortie live listens: udpout:HOST:PORT for its udpin:HOST:PORT.
+    vehicle
+        MAVLink system id of the vehicle; every vehicle heard if not given.
+    """
+    from telemetry.marks import say as send
+
+    text = send(to, action, name, vehicle)
+    print(f"{action} of test point {name} for {f'vehicle {vehicle}' if vehicle else 'every vehicle'}: {text!r} to {to}")
+
+
+def smooth(
+    log: Path,
+    *,
+    output: Path | None = None,
+    test_points: Path | None = None,
+    config: Path | None = None,
+    quiet: bool = False,
+) -> None:
     """Smooth a log, each boot as a whole, into one recording.
 
     Parameters
@@ -193,6 +222,8 @@ def smooth(log: Path, *, output: Path | None = None, config: Path | None = None,
         A .tlog file, or a sortie folder.
     output
         The recording to write; NAME.rrd in this folder if not given.
+    test_points
+        TOML or CSV file of test points (name, start, stop, vehicle), beside those that the log itself marks.
     config
         TOML file with settings.
     quiet
@@ -200,7 +231,12 @@ def smooth(log: Path, *, output: Path | None = None, config: Path | None = None,
     """
     configuration = configure(config) if config else None
     output = output or Path(log.resolve().name).with_suffix(".rrd")
-    summary = smooth_log(log, output, configuration, None if quiet else say)
+    points = []
+    if test_points:
+        from telemetry.marks import read
+
+        points = read(test_points)
+    summary = smooth_log(log, output, configuration, None if quiet else say, test_points=points)
     print(
         f"{output}: {counted(len(summary.vehicles), 'vehicle')}, {counted(len(summary.windows), 'window')}, "
         f"{summary.completeness}"
@@ -530,8 +566,51 @@ def bench_long(*, steps: int = 2_000_000, folder: Path | None = None) -> None:
     print(f"errors of the smoothed states: {told.error:.4f} of their sigmas, root mean square")
 
 
-COMMANDS: tuple[Callable[..., None], ...] = (demo, live, smooth, review, verify, replay, sim, ingest, estimate, record)
-BENCHMARKS: dict[str, Callable[..., None]] = {"smooth": bench_smooth, "linear": bench_linear, "long": bench_long}
+def bench_extended(*, steps: int = 3000, rounds: int = 7, json: bool = False) -> None:
+    """The smoother of the flight path beside a textbook extended RTS of the same model: time per step.
+
+    Both are compiled and do the same work in one run; a line says how nearly their answers agree.
+
+    Parameters
+    ----------
+    steps
+        Of the simulated records, 100 a second.
+    rounds
+        The least time of so many counts.
+    json
+        Print JSON instead of a table.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from sims.experiments.extended_speed import compare
+
+    found = compare(steps, rounds, tell=say)
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+        return
+    Console(highlight=False, width=max(Console().width, 130)).print(found.table())
+
+
+COMMANDS: tuple[Callable[..., None], ...] = (
+    demo,
+    live,
+    mark,
+    smooth,
+    review,
+    verify,
+    replay,
+    sim,
+    ingest,
+    estimate,
+    record,
+)
+BENCHMARKS: dict[str, Callable[..., None]] = {
+    "smooth": bench_smooth,
+    "linear": bench_linear,
+    "extended": bench_extended,
+    "long": bench_long,
+}
 REPRODUCTIONS: dict[str, Callable[..., None]] = {"shi": reproduce_shi}
 PURPOSE = "Turn the telemetry of a test flight into a trustworthy flight path while the aircraft still flies."
 
@@ -542,7 +621,7 @@ def _overview() -> str:
     about = [(command.__name__, inspect.getdoc(command) or "") for command in COMMANDS]
     about += [(f"bench {name}", inspect.getdoc(command) or "") for name, command in BENCHMARKS.items()]
     about += [(f"reproduce {name}", inspect.getdoc(command) or "") for name, command in REPRODUCTIONS.items()]
-    lines += [f"  {name:13} {text.splitlines()[0]}" for name, text in about]
+    lines += [f"  {name:14} {text.splitlines()[0]}" for name, text in about]
     lines += [
         "",
         "sortie COMMAND --help explains a command; --version tells the version; --debug shows where an error arose.",

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from telemetry.marks import Point
     from telemetry.messages import Message
     from viewer.summary import Summary
 
@@ -98,7 +99,14 @@ def write_what_runs(folder: Path, name: str, endpoints: Sequence[str], configura
         "dialect": {"name": dialect.name, "sha256": dialect.digest},
         "settings": msgspec.to_builtins(configuration),
     }
-    (folder / "sortie.toml").write_bytes(msgspec.toml.encode(what))
+    (folder / "sortie.toml").write_bytes(msgspec.toml.encode(_told(what)))
+
+
+def _told(value: Any) -> Any:
+    """Without what is None: TOML has no word for it, and read back it is the default."""
+    if isinstance(value, dict):
+        return {key: _told(item) for key, item in value.items() if item is not None}
+    return value
 
 
 def _read_what_ran(folder: Path) -> tuple[str, int, Any]:
@@ -336,6 +344,7 @@ def smooth_log(
     configuration: Any,
     tell: Callable[[str], None] | None,
     through: Callable[[str, Iterable[Any]], Iterable[Any]] = lambda _, stream: stream,
+    test_points: Sequence[Point] = (),
 ) -> Summary:
     """Smooth a log, each boot as a whole, into one recording.
 
@@ -347,6 +356,8 @@ def smooth_log(
         Given a line for every warning and test point; None also hides the progress bar.
     through : callable
         Every stream that one stage hands to the next passes through it, with the stage's name.
+    test_points : sequence of Point
+        Those to be marked beside what the log itself marks.
     """
     from functools import partial
 
@@ -355,6 +366,7 @@ def smooth_log(
 
     from estimator.stage import estimate
     from telemetry.ingest import ingest
+    from telemetry.marks import insert
     from viewer.recorder import record
 
     console = Console(stderr=True)
@@ -366,6 +378,7 @@ def smooth_log(
         bar.update(task, total=source.size)
         frames = through("read", source.batches())
         samples = through("decode", ingest(frames, source.links, dialect, configuration.ingest))
+        samples = insert(samples, test_points) if test_points else samples
         whole = partial(estimate, settings=configuration.estimate, scope="sortie")
         messages = through("estimate", also(samples, whole))
         if tell:

@@ -23,9 +23,9 @@ from telemetry.clockfit import ClockFitter
 from telemetry.frames import LATEST, Frames, join, scan_datagrams
 from telemetry.link import LinkAccounts
 from telemetry.mavlink import Dialect
-from telemetry.messages import Event, LinkBytes, Message, Progress, event
+from telemetry.messages import Event, LinkBytes, Mark, Message, Progress, StatusText, event
 from telemetry.sensors import FEEDS, Sensors
-from telemetry.text import Texts
+from telemetry.text import REDUNDANT, GroundMark, Texts, ground_mark, is_addressed, is_station, said_on_the_ground
 
 STAGE = "ingest"
 AUTOPILOT = 1
@@ -33,6 +33,7 @@ HEARTBEAT, SYSTEM_TIME = 0, 2
 UNIX_US = 10**15  # a time_usec above this is Unix time, below it is time since boot
 RECEIVE_STEP = 1_000_000_000
 BYTES_ROW = 1_000_000_000  # ns of receive time between two rows of the byte account
+NEVER = np.iinfo(np.int64).max
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -44,7 +45,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         MAVLink dialect, one that pymavlink ships.
     mark : str
         Regular expression of a test-point mark in a STATUSTEXT, with the groups ``name`` and ``action`` (start or
-        stop).
+        stop). It is held against the beginning of what a vehicle says, and of what a ground station says, who may add
+        ``@7`` for vehicle 7 alone (`telemetry.text`).
     """
 
     dialect: str = "ardupilotmega"
@@ -213,12 +215,20 @@ class _Ingest:
         for sysid in verified:
             if sysid not in self._systems:
                 self._systems[sysid] = _System(sysid, self._links, self._dialect, self._settings)
+        ground = said_on_the_ground(frames) if frames is not None else np.empty(0, np.bool_)
         for sysid, system in sorted(self._systems.items()):
             new = None
-            if frames is not None and len(rows := np.flatnonzero(frames.sysid == sysid)):
-                new = frames if len(rows) == len(frames) else frames.select(rows)
+            if frames is not None:
+                mine = frames.sysid == sysid
+                system.notice(frames, mine)
+                if ground.any():  # takes its place on the vehicle's clock among the vehicle's own frames
+                    mine |= ground & (frames.t_rx > system.heard)
+                if len(rows := np.flatnonzero(mine)):
+                    new = frames if len(rows) == len(frames) else frames.select(rows)
             if new is not None or system.waits or final or system.listens:
                 yield from system.feed(new, self._accounts, until, final)
+        for _, system in sorted(self._systems.items()):
+            yield from self._unheard(system)
         waiting = [system.waits for system in self._systems.values() if system.waits]
         covered = min([until, *(t - 1 for t in waiting)])
         self._reached = max(self._reached, covered)
@@ -235,6 +245,17 @@ class _Ingest:
                     yield self._account_of(link, now)
             yield Progress(vehicle=0, source=STAGE, boot=0, t=now, t_rx=now, final=final)
 
+    def _unheard(self, station: _System) -> Iterator[Event]:
+        """Tell of the marks that a ground station said for nobody."""
+        for t_rx, said, mark in station.marks:
+            vehicles = [v for v, system in self._systems.items() if system.heard < t_rx]
+            if not vehicles or (mark.vehicle and mark.vehicle not in vehicles):
+                who = f"vehicle {mark.vehicle}" if mark.vehicle else "no vehicle"
+                heard = f"{who} has {'not ' if mark.vehicle else ''}been heard yet"
+                text = f"mark {said!r} is not used: {heard}; say it again when one is"
+                yield event(text, level="warning", source=STAGE, t=t_rx, t_rx=t_rx)
+        station.marks.clear()
+
     def _account_of(self, link: int, now: NDArray[np.int64]) -> LinkBytes:
         names = ("bytes", "frames", "unknown", "corrupt", "discarded", "pending")
         columns: dict[str, Any] = {name: self._bytes[link, i : i + 1].copy() for i, name in enumerate(names)}
@@ -250,14 +271,23 @@ class _System:
     def __init__(self, sysid: int, links: Sequence[str], dialect: Dialect, settings: Settings) -> None:
         self.clock = BootClock(sysid)
         self.waits = 0  # receive time of the first frame that waits for its place, 0 if none does
+        self.heard = NEVER  # receive time of the first frame that shows it to be a vehicle
+        self.marks: list[tuple[int, str, GroundMark]] = []  # what it said as a ground station: time, words, meaning
         self._sysid, self._links, self._dialect, self._settings = sysid, links, dialect, settings
         self._held: Frames | None = None
         self._times = _BootTimes(dialect)
         self._fitter = ClockFitter(sysid, STAGE)
         self._sensors: dict[tuple[int, int], Sensors] = {}
-        self._texts: dict[int, Texts] = {}
+        self._texts: dict[tuple[int, int], Texts] = {}  # by system, itself or a ground station, and component
         self._seen: set[int] = set()  # components whose heartbeat has been told
-        self._heard: set[int] = set()  # components whose checksums are right
+        self._verified: set[int] = set()  # components whose checksums are right
+
+    def notice(self, frames: Frames, mine: NDArray[np.bool_]) -> None:
+        """See whether it is a vehicle: one has an autopilot, or measures."""
+        if self.heard == NEVER:
+            shows = (frames.compid == AUTOPILOT) | np.isin(frames.msgid, list(_MEASURING))
+            rows = np.flatnonzero(mine & frames.known & shows)
+            self.heard = int(frames.t_rx[rows[0]]) if len(rows) else NEVER
 
     def feed(self, new: Frames | None, accounts: LinkAccounts, until: int, final: bool) -> Iterator[Message]:
         parts = [part for part in (self._held, new) if part is not None]
@@ -265,8 +295,8 @@ class _System:
             yield from self._place(join(parts), accounts, until, final)
         yield from self._fits(final)
         covered = min(until, self.waits - 1) if self.waits else until
-        for texts in self._texts.values():
-            yield from texts.expire(covered, final)
+        for (sysid, compid), texts in self._texts.items():
+            yield from self._spoken(sysid, compid, texts.expire(covered, final))
 
     def _place(self, frames: Frames, accounts: LinkAccounts, until: int, final: bool) -> Iterator[Message]:
         """Give the frames their place on the vehicle's clock, as far as it can be told, and decode those."""
@@ -281,7 +311,7 @@ class _System:
             return
         self._times.commit(frames.compid[:n][boot_time[:n] != NO_TIME])
         done = frames if n == len(frames) else frames.select(slice(0, n))
-        counted = self._verified(done)
+        counted = self._counted(done)
         accounts.feed(
             done.link[counted],
             done.sysid[counted],
@@ -303,17 +333,25 @@ class _System:
         """Whether a text waits for its end."""
         return any(texts.waits for texts in self._texts.values())
 
-    def _verified(self, frames: Frames) -> NDArray[np.bool_]:
+    def _counted(self, frames: Frames) -> NDArray[np.bool_]:
         """Frames that count: an unknown id proves nothing, so its sender must have been verified before."""
-        counted = frames.known.copy()
-        for i in np.flatnonzero(~counted).tolist():
+        own = frames.sysid == self._sysid
+        known = frames.known & own
+        counted = known.copy()
+        for i in np.flatnonzero(~frames.known).tolist():
             same = frames.compid[:i] == frames.compid[i]
-            counted[i] = int(frames.compid[i]) in self._heard or bool((same & frames.known[:i]).any())
-        self._heard |= set(np.unique(frames.compid[frames.known]).tolist())
-        return counted
+            counted[i] = int(frames.compid[i]) in self._verified or bool((same & known[:i]).any())
+        self._verified |= set(np.unique(frames.compid[known]).tolist())
+        ground = np.flatnonzero(said_on_the_ground(frames) & own)
+        if len(ground):  # an addressed mark comes from a sender of its own, whose number continues nobody's
+            said = self._dialect.decode(frames, text.MSGID, ground)
+            counted[ground[[is_addressed(value) for value in said]]] = False
+        return np.asarray(counted)
 
     def _decode(self, frames: Frames, epochs: Epochs, rows: NDArray[np.int64], boot: int) -> Iterator[Message]:
         known = rows[frames.known[rows]]
+        spoken = known[frames.msgid[known] == text.MSGID]
+        known = known[frames.sysid[known] == self._sysid]
         for row in known[frames.msgid[known] == HEARTBEAT].tolist():
             compid = int(frames.compid[row])
             if compid not in self._seen:
@@ -333,16 +371,40 @@ class _System:
             if (link, compid) not in self._sensors:
                 self._sensors[link, compid] = Sensors(self._sysid, f"{self._links[link]}/{compid}")
             yield from self._sensors[link, compid].samples(decoded, epochs.t, frames.t_rx, boot)
-        spoken = known[frames.msgid[known] == text.MSGID]
-        for compid in np.unique(frames.compid[spoken]).tolist():
-            mine = spoken[frames.compid[spoken] == compid]
-            if compid not in self._texts:
+        speakers = frames.sysid[spoken].astype(np.int64) << 8 | frames.compid[spoken]
+        for speaker in np.unique(speakers).tolist():
+            sysid, compid = speaker >> 8, speaker & 255
+            mine = spoken[speakers == speaker]
+            if (sysid, compid) not in self._texts:
                 source = f"{self._links[int(frames.link[mine[0]])]}/{compid}"
-                self._texts[compid] = Texts(self._sysid, source, self._settings.mark)
+                self._texts[sysid, compid] = (
+                    Texts(self._sysid, source, None, duplicate=REDUNDANT)  # a vehicle may say it back over its link
+                    if is_station(sysid, compid)
+                    else Texts(self._sysid, source, self._settings.mark)
+                )
             values = self._dialect.decode(frames, text.MSGID, mine)
-            yield from self._texts[compid].read(
+            texts = self._texts[sysid, compid].read(
                 values, frames.seq[mine], frames.link[mine], epochs.t[mine], frames.t_rx[mine], boot
             )
+            yield from self._spoken(sysid, compid, texts)
+
+    def _spoken(self, sysid: int, compid: int, said: Sequence[StatusText | Mark]) -> Iterator[Message]:
+        """What a component said; of what a ground station said to this vehicle, the marks."""
+        for one in said:
+            if sysid == self._sysid:
+                yield one
+            if not is_station(sysid, compid) or not isinstance(one, StatusText):
+                continue
+            found = ground_mark(one.text[0], self._settings.mark)
+            if found and sysid == self._sysid:
+                self.marks.append((int(one.t_rx[0]), one.text[0], found))
+            if found and found.vehicle in (0, self._sysid) and one.t_rx[0] > self.heard:
+                common: dict[str, Any] = {"vehicle": self._sysid, "boot": one.boot}
+                yield Mark(
+                    **common, source=one.source, t=one.t, t_rx=one.t_rx, action=[found.action], name=[found.name]
+                )
+                words = f"ground station {sysid}/{compid} marks the {found.action} of test point {found.name}"
+                yield event(words, **common, source=STAGE, t=int(one.t[0]), t_rx=int(one.t_rx[0]))
 
     def _unix(self, frames: Frames) -> NDArray[np.int64]:
         """UTC that each frame tells, ns; 0 for the frames that tell none."""

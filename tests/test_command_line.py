@@ -6,12 +6,13 @@ import json
 import socket
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
 
 import sims
-from tests.console import RERUN, free_port, run
+from tests.console import RERUN, Process, free_port, run
 from tests.telemetry.wire import DATA, Sender, tlog
 
 US = 1_700_000_000_000_000
@@ -44,7 +45,8 @@ def test_help_loads_nothing_heavy():
 
 
 @pytest.mark.parametrize(
-    "command", ["demo", "live", "ingest", "estimate", "record", "smooth", "review", "replay", "sim", "verify", "bench"]
+    "command",
+    ["demo", "live", "mark", "ingest", "estimate", "record", "smooth", "review", "replay", "sim", "verify", "bench"],
 )
 def test_every_command_explains_itself(command):
     done = run(command, "--help")
@@ -180,6 +182,7 @@ def test_a_sortie_is_never_overwritten(tmp_path):
         (["smooth"], "requires an argument"),
         (["smooth", "a.tlog", "--windw", "3"], "Unknown option"),
         (["sim", "--to", "udpout:1", "--speed", "fast"], "Invalid value"),
+        (["mark", "begin", "12"], "Invalid value"),
     ],
 )
 def test_wrong_usage_is_exit_code_two(arguments, words):
@@ -196,6 +199,8 @@ def test_wrong_usage_is_exit_code_two(arguments, words):
         (["sim", "zeppelin", "--to", "udpout:14550"], "zeppelin"),
         (["review", "none.rrd"], "none.rrd: no such recording"),
         (["verify", "."], "is no sortie folder"),
+        (["mark", "start", "x" * 40], "choose a shorter name"),
+        (["mark", "start", "1", "--to", "udpin:14550"], "a mark is sent to where sortie live listens"),
     ],
 )
 def test_what_cannot_be_done_is_exit_code_one(arguments, words, tmp_path):
@@ -218,6 +223,56 @@ def test_settings_come_from_a_file_and_mistakes_in_it_are_named(log, tmp_path):
     done = run("smooth", log, "-o", "b.rrd", "--config", "bad.toml", cwd=tmp_path)
     assert done.returncode == 1
     assert "bad.toml: Expected `float`, got `str` - at `$.estimate.window`" in one_line(done)
+
+
+def test_a_test_point_is_marked_from_the_ground_while_live(tmp_path):
+    """What was marked is in the raw log, so a replay closes the same windows."""
+    port = free_port()
+    there = f"udpout:127.0.0.1:{port}"
+    flight = sims.fly("c172x", "demo", duration=30)
+    sender = threading.Thread(target=lambda: sims.send(sims.frames(flight), there, speed=4))
+    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", "s", "--idle", 2, cwd=tmp_path) as live:
+        live.wait_for("listening")
+        early = run("mark", "start", "early", "--to", there)
+        assert early.returncode == 0
+        live.wait_for("mark 'TP early start @0' is not used: no vehicle has been heard yet")
+        sender.start()
+        live.wait_for("system 1 component 1")
+        done = run("mark", "start", "trim 7", "--to", there, "--vehicle", 1)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout == f"start of test point trim 7 for vehicle 1: 'TP trim 7 start @1' to {there}\n"
+        live.wait_for("ground station 255/190 marks the start of test point trim 7")
+        assert run("mark", "stop", "trim 7", "--to", there).returncode == 0
+        live.wait_for("test point trim 7, ", timeout=30)
+        sender.join()
+        assert live.end() == 0, live.said
+    verified = run("verify", "s", cwd=tmp_path)
+    assert verified.returncode == 0, verified.stdout + verified.stderr
+    windows = json.loads(run("review", "s", "--json", cwd=tmp_path).stdout)["summary"]["windows"]
+    assert [w["reason"] for w in windows if w["test_point"] == "trim 7"][-1] == "mark"
+    lost = run("mark", "start", "late", "--to", there)
+    assert lost.returncode == 1
+    assert f"{there}: nobody listens there, so the mark is lost" in one_line(lost)
+
+
+def test_test_points_of_a_file_are_smoothed(log, tmp_path):
+    (tmp_path / "points.csv").write_text("name,start,stop\ntrim,5,12.5\nlate,90,100\n")
+    done = run("smooth", log, "-o", "out.rrd", "--test-points", "points.csv", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "warning: test point late (90 s to 100 s) is not used: the log, 0.0 s to " in done.stderr
+    windows = json.loads(run("review", "out.rrd", "--json", cwd=tmp_path).stdout)["summary"]["windows"]
+    trim = [w for w in windows if w["test_point"] == "trim"]
+    assert 7.0 < (max(w["t1"] for w in trim) - min(w["t0"] for w in trim)) * 1e-9 <= 7.5
+    assert "1" in [w["test_point"] for w in windows], "what the log marks stays"
+
+
+def test_a_mistake_in_a_file_of_test_points_is_named(log, tmp_path):
+    (tmp_path / "points.toml").write_text("[[test_point]]\nname = 1\nstart = 9\nstop = 5\n")
+    done = run("smooth", log, "--test-points", "points.toml", cwd=tmp_path)
+    assert done.returncode == 1
+    assert one_line(done) == "sortie: points.toml: test_point 1: stop = 5 is not after start = 9"
+    done = run("smooth", log, "--test-points", "none.csv", cwd=tmp_path)
+    assert one_line(done) == "sortie: none.csv: no such file or directory"
 
 
 @pytest.mark.parametrize(

@@ -267,6 +267,118 @@ def test_the_pattern_of_marks_is_a_setting():
     assert (marks[0].name, marks[0].action) == (["3"], ["stop"])
 
 
+def marks(messages: Iterable[Message]) -> list[tuple]:
+    return [(m.vehicle, m.boot, m.action[0], m.name[0], int(m.t[0])) for m in told(messages, Mark)]
+
+
+def ground(*said: tuple[float, str], seq: int = 40) -> list[tuple[int, bytes]]:
+    """What `sortie mark` sends, at seconds since the beginning; every mark has a number that continues nobody's."""
+    return [(US + round(s * 1e6), Sender(255, 190, seq=seq + 17 * i).text(text)) for i, (s, text) in enumerate(said)]
+
+
+def test_a_mark_from_the_ground_is_one_of_every_vehicle_at_its_own_time():
+    """Vehicle 1 reads 5 s at the beginning, vehicle 2 drifts: it has counted 1.9 s of 2."""
+    other = Sender(2)
+    drifting = [(US + 100_000 * i, other.pressure(9000 + 95 * i, 900)) for i in range(40)]
+    log = flight(4) + drifting + ground((2.05, "TP 3 start @0"), (2.55, "TP 3 stop @0"))
+    messages = run(read(tlog(sorted(log))))
+    t = (US + 1) * 1000
+    assert marks(messages) == [
+        (1, 0, "start", "3", t + 2_000_000_000),
+        (1, 0, "stop", "3", t + 2_500_000_000),
+        (2, 0, "start", "3", US * 1000 + 1_900_000_000),
+        (2, 0, "stop", "3", US * 1000 + 2_375_000_000),
+    ]
+    assert {m.vehicle for m in told(messages, StatusText)} == {255}
+    assert "ground station 255/190 marks the start of test point 3" in texts(messages)
+
+
+def test_a_mark_from_the_ground_may_name_one_vehicle():
+    other = Sender(2)
+    log = flight(4) + [(US + 100_000 * i, other.pressure(9000 + 100 * i, 900)) for i in range(40)]
+    messages = run(read(tlog(sorted(log + ground((2.05, "TP 3 start @2"))))))
+    assert [m[:4] for m in marks(messages)] == [(2, 0, "start", "3")]
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ((0.0, "TP 3 start"), "mark 'TP 3 start' is not used: no vehicle has been heard yet; say it again when one is"),
+        ((6.0, "TP 3 start @9"), "mark 'TP 3 start @9' is not used: vehicle 9 has not been heard yet"),
+        ((6.0, "TP 3 start @51"), "vehicle 51 has not been heard yet"),
+    ],
+)
+def test_a_mark_for_nobody_is_told_and_dropped(said, words):
+    """System 51 is a radio: it neither has an autopilot nor measures."""
+    later = [(us + 5_000_000, frame) for us, frame in flight(4)]
+    radio = [(US + 5_500_000, Sender(51, 68).heartbeat())]
+    messages = run(read(tlog(sorted(later + radio + ground(said)))))
+    assert marks(messages) == []
+    (warning,) = [m for m in told(messages, Event) if m.level == ["warning"]]
+    assert words in warning.text[0]
+    assert warning.t_rx[0] == (US + said[0] * 1e6) * 1000
+
+
+def test_a_mark_from_the_ground_after_a_reboot_belongs_to_the_new_boot():
+    messages = run(read(tlog(sorted(flight(30, reboot_at=15) + ground((5, "TP 1 start"), (28.1, "TP 1 stop"))))))
+    assert [m[:3] for m in marks(messages)] == [(1, 0, "start"), (1, 1, "stop")]
+
+
+@pytest.mark.parametrize(("links", "later"), [((0, 1), 8.0), ((0, 0), 8.0)])
+def test_a_mark_that_a_vehicle_passes_on_is_used_once(links, later):
+    """The frame comes back over another link, or over the same one, long after the stop has been said."""
+    log = flight(12) + ground((1.05, "TP 1 start @0"), (3.05, "TP 1 stop @0"))
+    log += [(us + round(later * 1e6), frame) for us, frame in ground((1.05, "TP 1 start @0"))]
+    log.sort()
+    number = [links[1] if us == US + round((1.05 + later) * 1e6) else links[0] for us, _ in log]
+    recorded = tlog([(us & ~3 | link, frame) for (us, frame), link in zip(log, number, strict=True)])
+    messages = run(read(recorded, links=2), links=("0", "1"))
+    assert [m[2] for m in marks(messages)] == ["start", "stop"]
+
+
+def test_marks_from_the_ground_are_no_loss_of_the_ground_station():
+    station = Sender(255, 190)
+    beats = [(US + 1_000_000 * i + 7, station.heartbeat()) for i in range(30)]
+    log = flight(30) + beats + ground((5.1, "TP 1 start @0"), (20.1, "TP 1 stop @0"), seq=200)
+    messages = run(read(tlog(sorted(log))))
+    account = [m for m in told(messages, LinkStats) if m.vehicle == 255][-1]
+    assert (account.received[-1], account.lost[-1], account.conflict[-1], account.restarted[-1]) == (30, 0, 0, 0)
+    assert told(messages, LinkBytes)[-1].frames[-1] == len(log), "but every frame is in the account of bytes"
+
+
+@given(st.lists(st.integers(0, 17_000), max_size=8))
+@settings(max_examples=25, deadline=None)
+def test_batches_do_not_change_marks_from_the_ground(cuts):
+    later = [(us + 3_000_000, frame) for us, frame in flight(30, reboot_at=15)]
+    said = [
+        (1, "TP 0 start"),
+        (3.0, "TP 0 start"),
+        (6, "TP 1 start @1"),
+        (18.01, "TP 1 stop @1"),
+        (36, "TP 2 start @4"),
+    ]
+    long = [
+        (US + 20_000_000 + i, Sender(255, 190, seq=i).text(text, id=3, chunk_seq=i))
+        for i, text in enumerate(["TP " + "x" * 47, "y" * 44 + " start"])
+    ]
+    log = tlog(sorted(later + ground(*said) + long))
+    whole = run(read(log))
+    assert [m[2:4] for m in marks(whole)] == [("start", "1"), ("stop", "1"), ("start", "x" * 47 + "y" * 44)]
+    assert_same(columns(run(read(log, [min(cut, len(log)) for cut in cuts]))), columns(whole))
+
+
+@given(st.lists(st.text("TP 1startop@09\x00\x1b\xff", max_size=30), max_size=6), st.sampled_from([0, 1, 255]))
+@settings(max_examples=25, deadline=None)
+def test_whatever_a_ground_station_says_harms_nothing(said, system):
+    log = flight(3)
+    for i, text in enumerate(said):
+        log.append((US + 1_000_000 + 1000 * i, Sender(system, 190).text(text, id=i % 3, chunk_seq=5 * i)))
+    messages = run(read(tlog(sorted(log))))
+    assert sum(len(m.t) for m in told(messages, Altitude)) == 12
+    assert {m.boot for m in told(messages, Altitude)} == {0}
+    assert not [m for m in told(messages, LinkStats) if m.source == "0/1" and m.lost[-1]]
+
+
 def test_nothing_in_nothing_out_but_the_end():
     messages = run([])
     assert told(messages, Progress)[-1].final

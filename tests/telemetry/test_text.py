@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from telemetry.mavlink import Dialect
 from telemetry.messages import Mark, StatusText
-from telemetry.text import PATIENCE, Texts, check_mark
+from telemetry.text import PATIENCE, GroundMark, Texts, check_mark, ground_mark, ground_text
 from tests.telemetry.test_frames import scan
 from tests.telemetry.wire import Sender
 
@@ -93,6 +97,58 @@ def test_marks_begin_and_end_test_points():
 def test_the_pattern_of_a_mark_can_be_set():
     texts = Texts(1, "0/1", r"^POINT (?P<action>start|stop): (?P<name>.+)$")
     assert read(texts, Sender().text("POINT start: phugoid 3"))[1].name == ["phugoid 3"]
+
+
+def test_a_pattern_may_ignore_case_and_a_text_without_both_groups_is_no_mark():
+    texts, sender = Texts(1, "0/1", r"(?i)^TP( (?P<name>\w+))? (?P<action>start|stop|hold)$"), Sender()
+    told = read(texts, *(sender.text(text) for text in ("tp 1 START", "tp 1 Stop", "tp 1 hold", "tp stop")))
+    assert [(m.action, m.name) for m in told if isinstance(m, Mark)] == [(["start"], ["1"]), (["stop"], ["1"])]
+
+
+@given(
+    st.sampled_from(["start", "stop"]),
+    st.text("aB1 @._-é", min_size=1, max_size=12).map(str.strip).filter(bool),
+    st.integers(0, 255),
+    st.sampled_from([r"^POINT (?P<name>\d+) (?P<action>start|stop)$", r"(?P<name>.*) (?P<action>start|stop)"]),
+)
+def test_what_is_said_on_the_ground_is_understood_whatever_the_pattern(action, name, vehicle, pattern):
+    assert ground_mark(ground_text(action, name, vehicle), pattern) == GroundMark(action, name, vehicle)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("TP 12 start", GroundMark("start", "12", 0)),
+        ("TP 12 stop @7", GroundMark("stop", "12", 7)),
+        ("TP two words start", None),
+        ("TP 12 pause @7", None),
+        ("hello @7", None),
+        ("TP 12 start @1234", None),
+        ("", None),
+    ],
+)
+def test_a_ground_station_may_use_the_words_of_a_vehicle_and_name_one(text, found):
+    assert ground_mark(text) == found
+
+
+def test_a_ground_station_may_use_the_pattern_that_is_set_and_name_a_vehicle():
+    pattern = r"^POINT (?P<action>start|stop): (?P<name>.+)$"
+    assert ground_mark("POINT start: phugoid 3 @2", pattern) == GroundMark("start", "phugoid 3", 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "vehicle", "words"),
+    [
+        ("x" * 50, 0, "has 12 more; choose a shorter name"),
+        ("", 0, "a name is printable"),
+        (" 1", 0, "a name is printable"),
+        ("a\nb", 0, "a name is printable"),
+        ("1", 256, "a MAVLink system is 1 to 255"),
+    ],
+)
+def test_what_cannot_be_said_from_the_ground_is_refused(name, vehicle, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        ground_text("start", name, vehicle)
 
 
 @pytest.mark.parametrize(
