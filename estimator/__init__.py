@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from estimator.parallel import Record, smooth_records
     from estimator.smoother import Unobservable
     from estimator.snapshots import Store
+    from estimator.stage.reconstruction import NoFlightPath, Reconstruction, reconstruct
     from estimator.window import Rule
 
 __all__ = [
@@ -30,11 +31,14 @@ __all__ = [
     "Filtered",
     "InformationFilter",
     "LinearModel",
+    "NoFlightPath",
+    "Reconstruction",
     "Record",
     "Rule",
     "Smoothed",
     "Store",
     "Unobservable",
+    "reconstruct",
     "smooth",
     "smooth_records",
 ]
@@ -44,11 +48,14 @@ _HOME = {
     "Filtered": "information",
     "InformationFilter": "information",
     "LinearModel": "model",
+    "NoFlightPath": "stage.reconstruction",
+    "Reconstruction": "stage.reconstruction",
     "Record": "parallel",
     "Rule": "window",
     "Smoothed": "linear",
     "Store": "snapshots",
     "Unobservable": "smoother",
+    "reconstruct": "stage.reconstruction",
     "smooth": "linear",
     "smooth_records": "parallel",
 }

@@ -88,10 +88,14 @@ class Arrivals:
         Number of the sensor that gives places.
     lag : int
         How long a sample waits for older ones, ns.
+    witnesses : int, optional
+        How many of the sensors, the first ones, can confirm a leap: not the fast ones, whose bursts are long. All if
+        not given.
     """
 
-    def __init__(self, sensors: tuple[str, ...], fix: int, *, lag: int) -> None:
+    def __init__(self, sensors: tuple[str, ...], fix: int, *, lag: int, witnesses: int | None = None) -> None:
         self._sensors, self._fix, self._late = sensors, fix, lag + LATE
+        self._witnesses = len(sensors) if witnesses is None else witnesses
         self._waiting: list[Rows] = []
         self._early: list[Rows] = []  # marks before the first fix of a leg
         self._origin: tuple[float, ...] | None = None  # Earth-fixed
@@ -132,14 +136,13 @@ class Arrivals:
             place, first = (latitude, longitude, altitude), found
             self._origin = tuple(to_earth(rows.z[found, 0], rows.z[found, 1], rows.z[found, 2]).tolist())
             self._newest, self._far = int(rows.t[found]), False
-        kept, end, over = self._walk(rows, first, final, notes)
+        index, times, end, over = self._walk(rows, first, final, notes)
         if over:
             self.forget()
         elif end < len(rows.t):  # undecided
             self._waiting.insert(0, take(rows, np.arange(end, len(rows.t))))
             rows = take(rows, np.arange(end))
-        index = np.array(list(kept), np.int64)
-        believed = take(rows, index)._replace(t=np.array(list(kept.values()), np.int64))
+        believed = take(rows, index)._replace(t=times)
         if place is not None and self._early:
             early, self._early = concatenate(self._early), []
             believed, index = concatenate([early, believed]), np.concatenate([np.full(len(early.t), -1), index])
@@ -160,14 +163,49 @@ class Arrivals:
             notes.append(_note(rows, i, "fixes at latitude 0, longitude 0 are none: left out"))
         return bool(nowhere)
 
-    def _walk(self, rows: Rows, first: int, final: bool, notes: list[Note]) -> tuple[dict[int, int], int, bool]:
-        """Times of the rows to be believed by their index, the index of the first row not judged, and whether the leg
+    def _walk(
+        self, rows: Rows, first: int, final: bool, notes: list[Note]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], int, bool]:
+        """Indices and times of the rows to be believed, the index of the first row not judged, and whether the leg
         ends there.
         """
-        times, sensors = rows.t.tolist(), rows.sensor.tolist()
         fixed = (rows.sensor == self._fix) & np.isfinite(rows.z[:, :3]).all(axis=1)
-        earth = np.zeros((len(times), 3))
+        earth = np.zeros((len(rows.t), 3))
         earth[fixed] = to_earth(rows.z[fixed, 0], rows.z[fixed, 1], rows.z[fixed, 2])
+        plain = self._plain(rows, first, fixed, earth)
+        begin = np.arange(first, plain)
+        if plain == len(rows.t):
+            return begin, rows.t[begin], plain, False
+        kept, end, over = self._judge_each(rows, plain, final, notes, fixed, earth)
+        index, times = np.array(list(kept), np.int64), np.array(list(kept.values()), np.int64)
+        return np.concatenate([begin, index]), np.concatenate([rows.t[begin], times]), end, over
+
+    def _plain(self, rows: Rows, first: int, fixed: NDArray[np.bool_], earth: NDArray[np.float64]) -> int:
+        """Index of the first row from `first` on that is not plainly to be believed; those before it are."""
+        assert self._origin is not None
+        t, mark = rows.t[first:], rows.sensor[first:] == MARK
+        seen = np.where(mark, np.iinfo(np.int64).min, t)
+        newest = np.maximum.accumulate(np.concatenate([[self._newest], seen]))
+        odd = (t > newest[:-1] + LEAP) | (~mark & (t < newest[:-1] - self._late))
+        at = fixed[first:]
+        odd[at] |= np.linalg.norm(earth[first:][at] - self._origin, axis=1) > FAR
+        odd[at] |= (rows.z[first:][at, 0] == 0) & (rows.z[first:][at, 1] == 0)
+        count = int(np.argmax(odd)) if odd.any() else len(t)
+        self._newest = int(newest[count])
+        self._far = self._far and not at[:count].any()
+        return first + count
+
+    def _judge_each(
+        self,
+        rows: Rows,
+        first: int,
+        final: bool,
+        notes: list[Note],
+        fixed: NDArray[np.bool_],
+        earth: NDArray[np.float64],
+    ) -> tuple[dict[int, int], int, bool]:
+        """Times of the rows from `first` on that are to be believed, by their index; the rest as `_walk`."""
+        times, sensors = rows.t.tolist(), rows.sensor.tolist()
         kept: dict[int, int] = {}
         for i in range(first, len(times)):
             t, sensor = times[i], sensors[i]
@@ -213,9 +251,9 @@ class Arrivals:
     def _confirmed(self, times: list[int], sensors: list[int], i: int) -> bool | None:
         """Whether the arrivals after i confirm its time; None when that cannot be said yet."""
         ahead = times[i] > self._newest
-        missing, last = (AHEAD if ahead else BEHIND) - 1, times[i]
+        missing, last = (AHEAD if ahead else BEHIND) - (sensors[i] < self._witnesses), times[i]
         for j in range(i + 1, len(times)):
-            if sensors[j] == MARK:
+            if sensors[j] == MARK or sensors[j] >= self._witnesses:
                 continue
             t = times[j]
             elsewhere = t > self._newest + LEAP if ahead else t < self._newest - self._late

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
-from viewer.columns import role
+from viewer.columns import TRAJECTORY, first, model_path, place, role, slug
+from viewer.states import GROUPS, OTHERS, group, measured, order, words
 
 TIMELINE = "t_vehicle"
 _STAGES = ("live", "window")
@@ -19,14 +20,12 @@ _SHOWN = {
     "velocity_north": "North velocity, m/s",
     "velocity_east": "East velocity, m/s",
 }
-_RAW = {
-    "altitude": ("gnss/altitude", "altitude/altitude"),
-    "climb_rate": ("gnss/climb_rate",),
-    "velocity_north": ("gnss/velocity_north",),
-    "velocity_east": ("gnss/velocity_east",),
-    "roll": ("attitude/roll",),
-    "pitch": ("attitude/pitch",),
-    "heading": ("attitude/heading",),
+_UNITS = {"Velocities": "m/s", "Angles": "rad", "Air data and wind": "m/s"}
+_UNIT = {
+    "h": "m",
+    **dict.fromkeys(("alpha", "beta", "b_alpha", "b_beta"), "rad"),
+    **dict.fromkeys(("ba_x", "ba_y", "ba_z"), "m/s2"),
+    **dict.fromkeys(("bg_x", "bg_y", "bg_z"), "rad/s"),
 }
 
 
@@ -80,57 +79,133 @@ def _vehicle(path: str) -> bool:
 
 
 def _page(name: str, entities: Collection[str], extent: Extent | None, *, live: bool, alone: bool) -> Any:
+    """One tab per model; the trajectory's, with the map, stands alone where there is no other."""
+    root, title = f"/{name}", f"Vehicle {name[1:]}"
+    others = [model for model in _models(root, entities) if model != TRAJECTORY]
+    if not others:
+        return _trajectory(root, entities, extent, title, live=live, alone=alone)
+    pages = [_flight_path(root, model, entities, title, live=live, alone=alone) for model in others]
+    if any(_states(root, TRAJECTORY, entities)):
+        pages.insert(0, _trajectory(root, entities, extent, "Trajectory", live=live, alone=alone))
+    for page, model in zip(pages[-len(others) :], others, strict=True):
+        page.name = model.replace("_", " ").capitalize() if len(pages) > 1 else title
+    return pages[0] if len(pages) == 1 else rrb.Tabs(*pages, active_tab=len(pages) - 1, name=title)
+
+
+def _trajectory(
+    root: str, entities: Collection[str], extent: Extent | None, title: str, *, live: bool, alone: bool
+) -> Any:
     axis = _axis(live=live)
-    root = f"/{name}"
-    states = _states(root, entities)
+    states = _states(root, TRAJECTORY, entities)
     raw = {path for path in entities if path.startswith(f"{root}/raw/")}
+    parent = model_path(int(root[2:]), TRAJECTORY)
     # One legend is enough, since a colour means the same everywhere: the others would cover what they explain.
     main = [
         _series(
-            title, _paths(root, [s for s in states if role(s) == key], _RAW[key], raw), axis, legend=key == "altitude"
+            heading,
+            _paths(root, parent, [s for s in states if role(s) == key], measured(key), raw),
+            axis,
+            legend=key == "altitude",
         )
-        for key, title in _SHOWN.items()
+        for key, heading in _SHOWN.items()
     ]
     main = [view for view in main if view is not None]
     others = [s for s in states if role(s) not in (*_SHOWN, "north", "east")]
     more = [
         view
         for s in others
-        if (view := _series(s.replace("_", " "), _paths(root, [s], _RAW.get(role(s), ()), raw), axis))
+        if (view := _series(s.replace("_", " "), _paths(root, parent, [s], measured(s), raw), axis))
     ]
-    lanes = rrb.StateTimelineView(
-        name="Boot epochs and windows", origin=root, contents=[f"{root}/boot", f"{root}/window"], time_view=axis
-    )
-    reports = rrb.TextDocumentView(name="Window report", origin=f"{root}/est/window/report")
+    lanes = _lanes(root, [f"{root}/boot", f"{root}/window"], axis)
+    windows = rrb.TextDocumentView(name="Window report", origin=f"{parent}/window/report")
     left: list[Any] = [*main, lanes] if main else [*_sensors(root, raw, axis)[:4], lanes]
-    tabs: list[Any] = [reports]
+    tabs: list[Any] = [*_reports(root, TRAJECTORY, entities), windows]
     tabs.append(_link(root, entities, axis, alone=alone))
-    tabs.append(_series("NIS", [f"{root}/est/live/nis"], axis))
+    tabs.append(_series("NIS", [f"{parent}/live/nis"], axis))
     if more:
         tabs.append(rrb.Grid(*more, name="Other states"))
     if raw:
         tabs.append(rrb.Grid(*_sensors(root, raw, axis), name="Sensors"))
     shares = [4.0, *[3.0] * (len(left) - 2), 2.5] if len(left) > 1 else [1.0]
     right = rrb.Vertical(
-        _map(root, extent),
+        _map(root, extent, entities),
         rrb.Tabs(*[tab for tab in tabs if tab is not None], active_tab=0),
         _events(),
         row_shares=[3, 3, 2],
     )
+    return rrb.Horizontal(rrb.Vertical(*left, row_shares=shares), right, column_shares=[3, 2], name=title)
+
+
+def _flight_path(root: str, model: str, entities: Collection[str], title: str, *, live: bool, alone: bool) -> Any:
+    """Its states in groups, each group a tab; the reports beside them."""
+    axis = _axis(live=live)
+    states = _states(root, model, entities)
+    raw = {path for path in entities if path.startswith(f"{root}/raw/")}
+    parent = model_path(int(root[2:]), model)
+    groups: dict[str, list[Any]] = {}
+    for s in sorted({*states, *(name for names in GROUPS.values() for name in names)}, key=order):
+        paths = _paths(root, parent, [s] if s in states else [], measured(s), raw)
+        if s in states or (paths and states):  # what is measured, and no state of the model, belongs there too
+            groups.setdefault(group(s), []).append(_series(_heading(s), paths, axis, legend=group(s) not in groups))
+    tabs = [
+        rrb.Vertical(*views, name=heading) if len(views) <= 4 else rrb.Grid(*views, grid_columns=2, name=heading)
+        for heading in (*GROUPS, OTHERS)
+        if (views := groups.get(heading))
+    ]
+    lanes = _lanes(root, [f"{root}/boot", f"{root}/window/{model}"], axis)
+    left = [rrb.Tabs(*tabs, active_tab=0), lanes] if tabs else [lanes]
+    documents: list[Any] = _reports(root, model, entities)
+    documents.append(rrb.TextDocumentView(name="Window figures", origin=f"{parent}/window/report"))
+    documents.append(_series("NIS", [f"{parent}/live/nis"], axis))
+    if raw:
+        documents.append(rrb.Grid(*_sensors(root, raw, axis), name="Sensors"))
+    documents.append(_link(root, entities, axis, alone=alone))
+    right = rrb.Vertical(
+        rrb.Tabs(*[view for view in documents if view is not None], active_tab=0), _events(), row_shares=[4, 1]
+    )
     return rrb.Horizontal(
-        rrb.Vertical(*left, row_shares=shares), right, column_shares=[3, 2], name=f"Vehicle {name[1:]}"
+        rrb.Vertical(*left, row_shares=[6.0, 1.0][: len(left)]), right, column_shares=[3, 2], name=title
     )
 
 
-def _states(root: str, entities: Collection[str]) -> list[str]:
-    found = {path.split("/")[-1] for path in entities for stage in _STAGES if path.startswith(f"{root}/est/{stage}/")}
-    return sorted(found - {"nis", "report", "geodetic"})
+def _heading(name: str) -> str:
+    said = words(name) or name.replace("_", " ")
+    unit = next((unit for title, unit in _UNITS.items() if name in GROUPS[title]), "")
+    unit = _UNIT.get(name, unit)
+    return f"{said[0].upper()}{said[1:]}{f', {unit}' if unit else ''}"
 
 
-def _paths(root: str, states: Iterable[str], raw: Iterable[str], there: Collection[str]) -> list[str]:
+def _reports(root: str, model: str, entities: Collection[str]) -> list[Any]:
+    """What the flight was worth, the widest scope first; of each the page at the cursor, which is the newest live."""
+    there = [(scope, f"{root}/report/{model}/{slug(scope)}") for scope in ("sortie", "test point", "window")]
+    return [
+        rrb.TextDocumentView(name=f"{scope.capitalize()} report", origin=path)
+        for scope, path in there
+        if path in entities
+    ]
+
+
+def _lanes(root: str, contents: list[str], axis: Any) -> Any:
+    return rrb.StateTimelineView(name="Boot epochs and windows", origin=root, contents=contents, time_view=axis)
+
+
+def _models(root: str, entities: Collection[str]) -> list[str]:
+    """Models that a vehicle has estimates, windows or reports of."""
+    found = {p.model for path in entities if path.startswith(f"{root}/est/") and (p := place(path)) is not None}
+    found |= {path.split("/")[3] for path in entities if path.startswith(f"{root}/report/")}
+    return sorted(found, key=first)
+
+
+def _states(root: str, model: str, entities: Collection[str]) -> list[str]:
+    here = [p for path in entities if path.startswith(f"{root}/est/") and (p := place(path)) is not None]
+    found = {p.name for p in here if p.model == model and p.stage in _STAGES}
+    return sorted(found - {"nis", "report", "geodetic"}, key=None if model == TRAJECTORY else order)
+
+
+def _paths(root: str, parent: str, states: Iterable[str], raw: Iterable[str], there: Collection[str]) -> list[str]:
     """Entities of one view, in the order in which they are drawn: raw below, smoothed on top."""
     paths = [path for name in raw if (path := f"{root}/raw/{name}") in there]
-    return paths + [f"{root}/est/{stage}/{state}" for stage in _STAGES for state in states]
+    return paths + [f"{parent}/{stage}/{state}" for stage in _STAGES for state in states]
 
 
 def _series(title: str, paths: list[str], axis: Any, *, legend: bool = True) -> Any:
@@ -147,14 +222,15 @@ def _sensors(root: str, raw: Collection[str], axis: Any) -> list[Any]:
     ]
 
 
-def _map(root: str, extent: Extent | None) -> Any:
+def _map(root: str, extent: Extent | None, entities: Collection[str]) -> Any:
     whole = rrb.VisibleTimeRange(TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
     extent = extent or Extent(-300.0, -300.0, 300.0, 300.0)
     spacing = _spacing(max(extent.east - extent.west, extent.north - extent.south))
+    branches = sorted(path for path in entities if path.startswith((f"{root}/world/live.", f"{root}/world/window.")))
     return rrb.Spatial3DView(
         name=f"Track from above, north up, grid {spacing:g} m",
         origin=f"{root}/world",
-        contents=[f"{root}/world/gnss", f"{root}/world/live", f"{root}/world/window"],
+        contents=[f"{root}/world/gnss", f"{root}/world/live", f"{root}/world/window", *branches],
         time_ranges=whole,
         eye_controls=_above(extent),
         line_grid=rrb.LineGrid3D(visible=True, spacing=spacing, color=(60, 60, 60)),

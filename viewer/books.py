@@ -18,10 +18,11 @@ from telemetry.messages import (
     Mark,
     Message,
     Progress,
+    Report,
     StatusText,
     Window,
 )
-from viewer.columns import Seam
+from viewer.columns import Seam, first
 from viewer.summary import (
     Account,
     Age,
@@ -36,6 +37,7 @@ from viewer.summary import (
     finite,
     smoothed,
 )
+from viewer.worth import worth
 
 COUNTERS = ("received", "lost", "late", "out_of_order", "duplicate", "conflict", "ambiguous", "restarted")
 BYTES = ("bytes", "frames", "unknown", "corrupt", "discarded", "pending")
@@ -86,6 +88,8 @@ class Books:
                     self._ages.append((now - int(t_rx[-1])) / 1e9)
             case Window():
                 whole.windows.append(smoothed(message))
+            case Report():
+                whole.reports.append(worth(message))
             case Event():
                 for level in message.level:
                     self._level(LEVELS[level])
@@ -128,6 +132,8 @@ class Books:
             self.vehicle(number).sensors.append(sensor)
         for (number, _), clock in sorted(self._clocks.items()):
             self.vehicle(number).clocks.append(clock)
+        for vehicle in self._vehicles.values():
+            vehicle.live.sort(key=lambda live: first(live.model))
         whole.vehicles = [self._vehicles[number] for number in sorted(self._vehicles)]
         whole.accounts = [self._links[key] for key in sorted(self._links)]
         whole.byte_accounts = [self._bytes[key] for key in sorted(self._bytes)]
@@ -140,11 +146,12 @@ class Books:
         self.summary.events[level] = self.summary.events.get(level, 0) + 1
 
     def _estimate(self, message: Estimate) -> None:
-        vehicle = self.vehicle(message.vehicle)
-        if vehicle.live is None:
-            vehicle.live = Live(model=message.model, names=[], units=[])
-        live = vehicle.live
-        live.model, live.names, live.units = message.model, list(message.names), list(message.units)
+        accounts = self.vehicle(message.vehicle).live
+        live = next((account for account in accounts if account.model == message.model), None)
+        if live is None:
+            live = Live(model=message.model, names=[], units=[])
+            accounts.append(live)
+        live.names, live.units = list(message.names), list(message.units)
         live.rows += len(message.t)
         live.determined += int((np.isfinite(message.mean) & np.isfinite(message.std)).all(axis=1).sum())
         tested = np.isfinite(message.nis) & (message.dof > 0)

@@ -14,9 +14,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.messages import AirData, Altitude, Attitude, Estimate, Floats, Gnss, Imu, Message, Times, Window
+from telemetry.messages import (
+    AirData,
+    Altitude,
+    Attitude,
+    Estimate,
+    Floats,
+    FlowAngles,
+    Gnss,
+    Imu,
+    Message,
+    Report,
+    Times,
+    Window,
+)
 
 GAP = 3.0  # s without a sample after which a line is broken
+TRAJECTORY = "trajectory"  # the model that every flight has: its states need no branch of their own
 
 
 class Belief(NamedTuple):
@@ -85,6 +99,34 @@ def belief(mean: Floats, std: Floats) -> tuple[Floats, Floats]:
         return np.where(unknown, np.nan, mean), np.where(unknown, np.nan, np.square(std))
 
 
+class Place(NamedTuple):
+    """What the path of an estimated state says: ``/v1/est/live/altitude`` or ``/v1/est/flight_path/live/u``."""
+
+    vehicle: int
+    model: str
+    stage: str
+    name: str
+
+
+def place(entity: str) -> Place | None:
+    """Take the path of an estimated state apart; None for any other path."""
+    parts = entity.split("/")[1:]
+    if len(parts) not in (4, 5) or parts[1] != "est" or not re.fullmatch(r"v\d+", parts[0]):
+        return None
+    return Place(int(parts[0][1:]), TRAJECTORY if len(parts) == 4 else parts[2], parts[-2], parts[-1])
+
+
+def first(model: str) -> tuple[bool, str]:
+    """Sorting key of models: the one of every flight first, the others by name."""
+    return model != TRAJECTORY, model
+
+
+def model_path(vehicle: int, model: str) -> str:
+    """Where the stages of a model are: models of one vehicle stand side by side and share no entity."""
+    root = f"{vehicle_path(vehicle)}/est"
+    return root if model == TRAJECTORY else f"{root}/{slug(model)}"
+
+
 def estimate_path(message: Estimate | Window) -> str:
     """Parent entity of the states of an estimate or window.
 
@@ -92,7 +134,12 @@ def estimate_path(message: Estimate | Window) -> str:
     say which.
     """
     stage = "window" if isinstance(message, Window) else "live"
-    return f"{vehicle_path(message.vehicle)}/est/{stage}"
+    return f"{model_path(message.vehicle, message.model)}/{stage}"
+
+
+def report_path(message: Report) -> str:
+    """Entity of a report: one for each scope, so that none hides another that covers the same time."""
+    return f"{vehicle_path(message.vehicle)}/report/{slug(message.model)}/{slug(message.scope)}"
 
 
 def belief_columns(message: Estimate | Window) -> dict[str, Belief]:
@@ -119,6 +166,8 @@ def sensor_columns(message: Message) -> dict[str, Floats]:
             return {"roll": message.phi, "pitch": message.theta, "heading": message.psi}
         case AirData():
             return {"airspeed": message.airspeed, "differential_pressure": message.differential_pressure}
+        case FlowAngles():
+            return {"alpha": message.alpha, "beta": message.beta}
         case Altitude():
             return {"altitude": message.altitude, "pressure": message.pressure, "sigma": message.sigma}
         case Gnss():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.messages import Estimate, Message, Times, Window
-from viewer.columns import GAP, Seam, belief_columns, broken, broken_times, estimate_path
+from telemetry.messages import Estimate, Message, Report, Times, Window
+from viewer.columns import GAP, Seam, belief_columns, broken, broken_times, estimate_path, report_path
 from viewer.reading import Reading
+from viewer.worth import Worth, worth
 
 _FIELDS = ("t", "t_rx", "mean", "variance")
 
@@ -28,7 +30,7 @@ class Difference(msgspec.Struct, frozen=True, kw_only=True):
     t : int
         Vehicle time of the row, ns.
     what : str
-        "t", "t_rx", "mean", "variance", "rows" or "entity".
+        "t", "t_rx", "mean", "variance", "rows" or "entity"; of a report the first of its fields.
     recorded, replayed : str
         Both sides, exact.
     count : int
@@ -73,14 +75,15 @@ def stored(messages: Iterable[Message], gap: float = GAP) -> dict[str, NDArray[n
 
 
 def compare(path: str | Path, messages: Iterable[Message]) -> list[Difference]:
-    """Compare every estimate and window of a recording with those of a replay, bit for bit: times, means, variances.
+    """Compare every estimate, window and report of a recording with those of a replay, bit for bit: times, means,
+    variances, and all that a report says.
 
     Parameters
     ----------
     path : path
         Recording or sortie folder.
     messages : iterable of Message
-        What the replay gives; kinds other than estimates and windows are passed over.
+        What the replay gives; other kinds are passed over.
 
     Returns
     -------
@@ -89,10 +92,15 @@ def compare(path: str | Path, messages: Iterable[Message]) -> list[Difference]:
     """
     with Reading(path) as reading:
         gap = reading.constant("/__properties/run", "gap")
-        replayed = stored(messages, GAP if gap is None else float(gap))
+        told: dict[str, list[Worth]] = {}
+        replayed = stored(_aside(messages, told), GAP if gap is None else float(gap))
         recorded = {}
+        reports: dict[str, list[Worth]] = {}
         for entity in reading.chunks:
-            if "/est/" in entity:
+            if "/report/" in entity:
+                _, texts = reading.column(entity, "report")
+                reports[entity] = [msgspec.json.decode(text, type=Worth) for text in texts]
+            elif "/est/" in entity:
                 (t, t_rx), rows = reading.columns(
                     entity, ("Measurements:values", "Measurements:variances"), ("t_vehicle", "t_rx")
                 )
@@ -102,7 +110,37 @@ def compare(path: str | Path, messages: Iterable[Message]) -> list[Difference]:
         _first(entity, recorded.get(entity), replayed.get(entity))
         for entity in sorted(recorded.keys() | replayed.keys())
     ]
+    found += [_unlike(entity, reports.get(entity, []), told.get(entity, [])) for entity in sorted(reports | told)]
     return [difference for difference in found if difference is not None]
+
+
+def _aside(messages: Iterable[Message], reports: dict[str, list[Worth]]) -> Iterator[Message]:
+    """Messages as they come; what the reports among them say is put aside, by entity."""
+    for message in messages:
+        if isinstance(message, Report):
+            reports.setdefault(report_path(message), []).append(worth(message))
+        yield message
+
+
+def _unlike(entity: str, recorded: list[Worth], replayed: list[Worth]) -> Difference | None:
+    """The first difference between reports, if there is one."""
+    texts = [sorted((r.end, r.begin, msgspec.json.encode(r)) for r in side) for side in (recorded, replayed)]
+    pairs = list(zip_longest(*texts))
+    unlike = [i for i, (a, b) in enumerate(pairs) if a != b]
+    if not unlike:
+        return None
+    mine, theirs = pairs[unlike[0]]
+    there = mine or theirs
+    assert there is not None
+    if mine is None or theirs is None:
+        what, sides = "rows", [f"{len(side)} reports" for side in texts]
+    else:
+        fields = [msgspec.json.decode(side[2]) for side in (mine, theirs)]
+        what = next(name for name in fields[0] if fields[0][name] != fields[1][name])
+        sides = [str(side[what]) for side in fields]
+    return Difference(
+        entity=entity, row=unlike[0], t=there[0], what=what, recorded=sides[0], replayed=sides[1], count=len(unlike)
+    )
 
 
 def _table(t: Times, t_rx: Times, values: NDArray[Any], variances: NDArray[Any]) -> NDArray[np.int64]:

@@ -11,11 +11,12 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from telemetry.messages import Estimate, Event, Floats, Mark, Message, StatusText, Times, Window
+from telemetry.messages import Estimate, Event, Floats, Mark, Message, Report, StatusText, Times, Window
 from viewer import style
 from viewer.blueprint import Extent
 from viewer.books import LEVELS, SEVERITIES
 from viewer.columns import (
+    TRAJECTORY,
     Seam,
     belief_columns,
     broken,
@@ -24,12 +25,17 @@ from viewer.columns import (
     geodetic,
     joined,
     local_metres,
+    place,
+    report_path,
     sensor_columns,
+    slug,
     vehicle_path,
 )
 from viewer.sink import Sink, degrees
 from viewer.summary import markdown, smoothed
 from viewer.track import Strip, Track
+from viewer.worth import markdown as page
+from viewer.worth import worth
 
 
 class Group(NamedTuple):
@@ -72,15 +78,19 @@ class Drawing:
         self._lines: dict[str, Group] = {}
         self._heard: dict[int, list[Message]] = {}  # sensor messages since the last boundary of the stream
         self._presence: dict[int, Seam] = {}
-        self._windows: dict[int, dict[tuple[int, int], int]] = {}
-        self._scopes: dict[int, str] = {}
-        self._mixed: set[int] = set()
+        self._windows: dict[tuple[int, str], dict[tuple[int, int], int]] = {}  # by vehicle and model, as all of windows
+        self._scopes: dict[tuple[int, str], str] = {}
+        self._mixed: set[tuple[int, str]] = set()
+        self._placed: set[str] = set()
+        self._begun: dict[tuple[int, int], int] = {}  # when a boot epoch was first heard
         self._styled: set[tuple[int, str]] = set()
-        self._test_points: dict[int, list[str]] = {}
+        self._test_points: dict[str, list[str]] = {}
 
     def hear(self, message: Message) -> None:
         """Note that a vehicle was heard; drawn by `presences`."""
         self._heard.setdefault(message.vehicle, []).append(message)
+        epoch, t = (message.vehicle, message.boot), int(message.t.min())
+        self._begun[epoch] = min(t, self._begun.get(epoch, t))
 
     def finish(self, groups: list[Group]) -> None:
         """Draw what was still growing."""
@@ -117,18 +127,20 @@ class Drawing:
         self._track(self.main, group, run, t, t_rx, at)
 
     def window(self, window: Window) -> None:
-        """Smoothed states of a window, its report and its lane."""
-        known = self._windows.setdefault(window.vehicle, {})
+        """Smoothed states of a window, its figures and its lane."""
+        stream = window.vehicle, window.model
+        known = self._windows.setdefault(stream, {})
         first = (window.boot, window.number) not in known
         number = known.setdefault((window.boot, window.number), len(known))
         parent = estimate_path(window)
         if parent not in self._lines:
             self._lines[parent] = Group(parent, [], Seam(self._gap), Track(joins=True), [0], True)
         group = self._lines[parent]
-        if self._scopes.setdefault(window.vehicle, window.scope) != window.scope and window.vehicle not in self._mixed:
-            self._mixed.add(window.vehicle)
+        if self._scopes.setdefault(stream, window.scope) != window.scope and stream not in self._mixed:
+            self._mixed.add(stream)
+            which = "windows" if window.model == TRAJECTORY else f"windows of the {window.model.replace('_', ' ')}"
             text = (
-                f"v{window.vehicle}: windows smoothed at their closing and over the whole sortie lie in one recording"
+                f"v{window.vehicle}: {which} smoothed at their closing and over the whole sortie lie in one recording"
             )
             self.main.texts("/events", window.t[:1], window.t_rx[:1], [text], ["WARN"])
         at, times, receive = group.seam.find(window.boot, window.t, window.t_rx)
@@ -146,9 +158,24 @@ class Drawing:
         if first:
             self._lane(window, number)
 
+    def report(self, report: Report) -> None:
+        """What a stretch of flight is worth, as a page, at its beginning: a cursor inside the stretch shows it.
+
+        A whole sortie begins with its boot epoch, so that its page is there wherever the cursor stands.
+        """
+        told = worth(report)
+        begin = report.begin
+        if report.scope == "sortie":
+            begin = min(begin, self._begun.get((report.vehicle, report.boot), begin))
+        text = rr.TextDocument(page(told), media_type=rr.MediaType.MARKDOWN)
+        values = rr.AnyValues(report=msgspec.json.encode(told).decode())
+        self.layer.once(report_path(report), begin, int(report.t_rx[-1]), text, values)
+
     def _lane(self, window: Window, number: int) -> None:
         entity = f"{vehicle_path(window.vehicle)}/window"
-        names = self._test_points.setdefault(window.vehicle, [])
+        if window.model != TRAJECTORY:
+            entity += f"/{slug(window.model)}"
+        names = self._test_points.setdefault(entity, [])
         state = window.test_point or style.BETWEEN[number % 2]
         if window.test_point and window.test_point not in names:
             names.append(window.test_point)
@@ -170,8 +197,15 @@ class Drawing:
             self._style(sink, entity, style.belief(entity, name, beliefs[0].unit))
             sink.measurements(entity, t, t_rx, values, variances, window)
         entity = f"{estimate_path(run[0])}/geodetic"
+        points = broken(joined(run, "geodetic"), at)
+        if entity not in self._placed:  # a model without a position has no column of nothing
+            known = np.flatnonzero(np.isfinite(points).all(axis=1))
+            if not len(known):
+                return
+            self._placed.add(entity)
+            t, t_rx, points = t[known[0] :], t_rx[known[0] :], points[known[0] :]
         self._style(sink, entity, style.geodetic())
-        sink.scalars(entity, t, t_rx, broken(joined(run, "geodetic"), at), window)
+        sink.scalars(entity, t, t_rx, points, window)
 
     def clock(self, group: Group, messages: list[Message]) -> None:
         """What the vehicle clock was worth over time."""
@@ -232,7 +266,7 @@ class Drawing:
         if isinstance(run[0], Estimate) and self.origin is not None:
             known = np.isfinite(points).all(axis=1)
             if known.any():
-                entity = f"{vehicle_path(run[0].vehicle)}/world/body"
+                entity = f"{vehicle_path(run[0].vehicle)}/world/body{_branch(run[0].model)}"
                 self._style(sink, entity, style.body(run[0].vehicle))
                 here = local_metres(points[known], self.origin)
                 sink.points(entity, t[known], t_rx[known], [row[None] for row in here])
@@ -242,20 +276,22 @@ class Drawing:
         if not strips or self.origin is None:
             return
         root, kind = "/" + parent.split("/")[1], parent.split("/")[-1]
+        here = place(f"{parent}/geodetic")
+        branch = "" if here is None else _branch(here.model)
         sink = self.layer if kind == "window" else self.main
         t, t_rx = np.array([s.t for s in strips]), np.array([s.t_rx for s in strips])
         metres = [local_metres(s.points, self.origin) for s in strips]
         angles = [degrees(s.points) for s in strips]
         self._see(root[1:], np.concatenate(metres))
-        for place, rows in (("world", metres), ("geo", angles)):
-            entity = f"{root}/{place}/{kind}"
-            self._style(sink, entity, style.track(place, kind))
+        for view, rows in (("world", metres), ("geo", angles)):
+            entity = f"{root}/{view}/{kind}{branch}"
+            self._style(sink, entity, style.track(view, kind))
             write = {
                 ("world", True): sink.lines,
                 ("world", False): sink.points,
                 ("geo", True): sink.geo_lines,
                 ("geo", False): sink.geo_points,
-            }[place, track.joins]
+            }[view, track.joins]
             write(entity, t, t_rx, rows)
 
     def _see(self, name: str, metres: Floats) -> None:
@@ -298,3 +334,8 @@ class Drawing:
         if (id(sink), entity) not in self._styled:
             self._styled.add((id(sink), entity))
             sink.static(entity, what)
+
+
+def _branch(model: str) -> str:
+    """What sets the track of a model apart from that of the trajectory."""
+    return "" if model == TRAJECTORY else f".{slug(model)}"

@@ -2,31 +2,56 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from telemetry.messages import Floats
-from viewer.columns import local_metres, role
+from viewer.columns import TRAJECTORY, first, local_metres, model_path, place, role
 from viewer.reading import Reading
 from viewer.review import Review, review
-from viewer.summary import Smoothed, utc
+from viewer.summary import Smoothed
+from viewer.text import utc
 
 RAW, LIVE, SMOOTHED = "#8a8a8a", "#1f6fd6", "#f08000"
-_ROWS = (
-    ("altitude", "altitude, m"),
-    ("climb_rate", "climb rate, m/s"),
-    ("velocity_north", "north velocity, m/s"),
-    ("velocity_east", "east velocity, m/s"),
+
+
+class _Row(NamedTuple):
+    """A diagram: what it shows of the states, by role or name, each with its dashes; what was measured; its scale."""
+
+    title: str
+    states: tuple[tuple[str, str], ...]
+    raw: tuple[tuple[str, str, str], ...] = ()  # quantity, colour, label
+    scale: float = 1.0
+
+
+_ALTITUDES = ("gnss/altitude", RAW, "raw GNSS"), ("altitude/altitude", "#b9c4b4", "raw barometer")
+_TRAJECTORY = (
+    _Row("altitude, m", (("altitude", "-"),), _ALTITUDES),
+    _Row("climb rate, m/s", (("climb_rate", "-"),), (("gnss/climb_rate", RAW, "raw GNSS"),)),
+    _Row("north velocity, m/s", (("velocity_north", "-"),), (("gnss/velocity_north", RAW, "raw GNSS"),)),
+    _Row("east velocity, m/s", (("velocity_east", "-"),), (("gnss/velocity_east", RAW, "raw GNSS"),)),
+    _Row("sigma, m", (("altitude", "-"), ("north", ":"))),
+)
+_ATTITUDE = ("attitude/pitch", RAW, "raw attitude"), ("attitude/roll", "#b9c4b4", "raw attitude")
+_FLIGHT_PATH = (
+    _Row("height, m", (("altitude", "-"),), _ALTITUDES),
+    _Row("u, m/s", (("u", "-"),), (("air_data/airspeed", RAW, "raw airspeed"),)),
+    _Row("v (-), w (:), m/s", (("v", "-"), ("w", ":"))),
+    _Row("pitch (-), roll (:), deg", (("pitch", "-"), ("roll", ":")), _ATTITUDE, math.degrees(1.0)),
+    _Row("sigma, m/s", (("u", "-"), ("v", "--"), ("w", ":"))),
 )
 _POINTS = 20000  # per line: more than a picture can show, few enough to draw in a second
 
 
-def plot(recording: str | Path | Review, out: str | Path, *, vehicle: int | None = None) -> None:
-    """Draw altitude, velocities, their uncertainty and the map: raw, live and smoothed with bands of two standard
-    deviations.
+def plot(
+    recording: str | Path | Review, out: str | Path, *, vehicle: int | None = None, model: str | None = None
+) -> None:
+    """Draw height, velocities, their uncertainty and the map: raw, live and smoothed with bands of two standard
+    deviations; of a flight path also attitude.
 
     Parameters
     ----------
@@ -36,11 +61,13 @@ def plot(recording: str | Path | Review, out: str | Path, *, vehicle: int | None
         PNG, 1600 x 1000 pixels.
     vehicle : int, optional
         Which one; the first if not given.
+    model : str, optional
+        Whose estimate; the trajectory if not given, or what else there is.
 
     Raises
     ------
     ValueError
-        If the vehicle is not in the recording.
+        If the vehicle, or the model, is not in the recording.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -58,14 +85,21 @@ def plot(recording: str | Path | Review, out: str | Path, *, vehicle: int | None
     if number not in numbers:
         raise ValueError(f"vehicle {number} is not in the recording: it holds {', '.join(map(str, numbers))}")
     with Reading(source) as reading:
-        _Picture(figure, found, reading, number).draw()
+        _Picture(figure, found, reading, number, model).draw()
     figure.savefig(out)
 
 
 class _Picture:
-    def __init__(self, figure: Any, found: Review, reading: Reading, number: int) -> None:
+    def __init__(self, figure: Any, found: Review, reading: Reading, number: int, model: str | None) -> None:
         self.figure, self.found, self.reading, self.root = figure, found, reading, f"/v{number}"
-        self.windows = [w for w in found.summary.windows if w.vehicle == number]
+        there = {p.model for path in reading.chunks if (p := place(path)) is not None and p.vehicle == number}
+        if model is not None and model not in there:
+            raise ValueError(
+                f"vehicle {number} has no estimate of the model {model!r}: it has {', '.join(sorted(there)) or 'none'}"
+            )
+        self.model = min(there, key=first, default=TRAJECTORY) if model is None else model
+        self.rows = _TRAJECTORY if self.model == TRAJECTORY else _FLIGHT_PATH
+        self.windows = [w for w in found.summary.windows if (w.vehicle, w.model) == (number, self.model)]
         self.vehicle = next(v for v in found.summary.vehicles if v.vehicle == number)
         starts = [boot.t0 for boot in self.vehicle.boots] or [found.summary.t0]
         self.zero = starts[0]
@@ -75,11 +109,9 @@ class _Picture:
         left, right = self.figure.add_gridspec(1, 2, width_ratios=(3, 2))
         rows = left.subgridspec(5, 1, height_ratios=(4, 2, 2, 2, 2))
         axes: list[Any] = []
-        for i, (key, title) in enumerate(_ROWS):
+        for i, row in enumerate(self.rows):
             axes.append(self.figure.add_subplot(rows[i], sharex=axes[0] if axes else None))
-            self._series(axes[-1], key, title)
-        axes.append(self.figure.add_subplot(rows[4], sharex=axes[0]))
-        self._sigma(axes[-1])
+            (self._sigma if i == 4 else self._series)(axes[-1], row)
         for axis in axes:
             self._shade(axis, names=axis is axes[0])
             axis.grid(alpha=0.25)
@@ -99,10 +131,12 @@ class _Picture:
         return (t - self.zero) / 1e9
 
     def _state(self, stage: str, key: str) -> tuple[Floats, Floats, Floats] | None:
-        """Seconds, values and standard deviations of the state with this role."""
-        parent = f"{self.root}/est/{stage}/"
+        """Seconds, values and standard deviations of the state with this role or name."""
         for entity in sorted(self.reading.chunks):
-            if entity.startswith(parent) and role(entity.removeprefix(parent)) == key:
+            here = place(entity)
+            if here is None or here[:3] != (self.vehicle.vehicle, self.model, stage):
+                continue
+            if key in (here.name, role(here.name)):
                 components = ("Measurements:values", "Measurements:variances")
                 (t,), (values, variances) = self.reading.columns(entity, components, ("t_vehicle",))
                 if len(t):
@@ -111,57 +145,51 @@ class _Picture:
                     return self._seconds(t[keep]), values[keep], np.sqrt(variances[keep])
         return None
 
-    def _series(self, axis: Any, key: str, title: str) -> None:
-        t, raw = self.reading.column(f"{self.root}/raw/gnss/{key}", "Scalars:scalars")
-        spans: list[Floats] = [raw]
-        every = max(1, len(t) // _POINTS)
-        axis.plot(self._seconds(t[::every]), raw[::every], ".", color=RAW, markersize=2.5, label="raw GNSS", zorder=1)
-        if key == "altitude":
-            t, raw = self.reading.column(f"{self.root}/raw/altitude/altitude", "Scalars:scalars")
-            every = max(1, len(t) // _POINTS)
+    def _series(self, axis: Any, row: _Row) -> None:
+        spans: list[Floats] = []
+        for i, (quantity, colour, label) in enumerate(row.raw):
+            t, raw = self.reading.column(f"{self.root}/raw/{quantity}", "Scalars:scalars")
+            every, raw = max(1, len(t) // _POINTS), raw * row.scale
+            size = 1.5 if i else 2.5
             axis.plot(
-                self._seconds(t[::every]),
-                raw[::every],
-                ".",
-                color="#b9c4b4",
-                markersize=1.5,
-                label="raw barometer",
-                zorder=0,
+                self._seconds(t[::every]), raw[::every], ".", color=colour, markersize=size, label=label, zorder=1 - i
             )
             spans.append(raw)
         for stage, colour, name in (("live", LIVE, "live"), ("window", SMOOTHED, "smoothed")):
-            state = self._state(stage, key)
-            if state is None:
-                continue
-            s, values, std = state
-            axis.plot(
-                s, values, color=colour, linewidth=1.0 if stage == "live" else 1.5, label=f"{name} ± 2 sigma", zorder=3
-            )
-            axis.fill_between(s, values - 2 * std, values + 2 * std, color=colour, alpha=0.22, linewidth=0, zorder=2)
-            spans.append(values)
+            for key, dashes in row.states:
+                state = self._state(stage, key)
+                if state is None:
+                    continue
+                s, values, std = state[0], state[1] * row.scale, state[2] * row.scale
+                legend = f"{name} ± 2 sigma" if key == row.states[0][0] else None
+                width = 1.0 if stage == "live" else 1.5
+                axis.plot(s, values, dashes, color=colour, linewidth=width, label=legend, zorder=3)
+                low, high = values - 2 * std, values + 2 * std
+                axis.fill_between(s, low, high, color=colour, alpha=0.22, linewidth=0, zorder=2)
+                spans.append(values)
         self._limits(axis, spans)
-        axis.set_ylabel(title)
+        axis.set_ylabel(row.title)
 
     @staticmethod
     def _limits(axis: Any, spans: list[Floats]) -> None:
         """The lines decide about the range: a band that is wide for a second must not flatten an hour."""
-        known = np.concatenate([span[np.isfinite(span)] for span in spans])
+        known = np.concatenate([np.empty(0), *(span[np.isfinite(span)] for span in spans)])
         if len(known):
             low, high = np.percentile(known, [0.2, 99.8])
             room = 0.15 * max(high - low, 1.0)
             axis.set_ylim(low - room, high + room)
 
-    def _sigma(self, axis: Any) -> None:
+    def _sigma(self, axis: Any, row: _Row) -> None:
         for stage, colour, name in (("live", LIVE, "live"), ("window", SMOOTHED, "smoothed")):
-            for key, dashes in (("altitude", "-"), ("north", ":")):
+            for key, dashes in row.states:
                 state = self._state(stage, key)
                 if state is not None:
                     positive = np.where(state[2] > 0, state[2], np.nan)
                     axis.semilogy(state[0], positive, dashes, color=colour, linewidth=1.2, label=f"{key}, {name}")
-        axis.set_ylabel("sigma, m")
+        axis.set_ylabel(row.title)
         if axis.lines:
             axis.legend(
-                loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=7, ncols=4, frameon=False, borderaxespad=0.1
+                loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=7, ncols=6, frameon=False, borderaxespad=0.1
             )
 
     def _shade(self, axis: Any, *, names: bool) -> None:
@@ -201,7 +229,8 @@ class _Picture:
     def _map(self, axis: Any) -> None:
         origin: Floats | None = None
         for kind, colour, name in (("live", LIVE, "live"), ("window", SMOOTHED, "smoothed")):
-            _, points = self.reading.column(f"{self.root}/est/{kind}/geodetic", "Scalars:scalars")
+            parent = model_path(self.vehicle.vehicle, TRAJECTORY)  # the model that has a place
+            _, points = self.reading.column(f"{parent}/{kind}/geodetic", "Scalars:scalars")
             if not len(points):
                 continue
             if origin is None:

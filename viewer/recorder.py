@@ -23,12 +23,13 @@ from telemetry.messages import (
     Mark,
     Message,
     Progress,
+    Report,
     StatusText,
     Window,
 )
 from viewer.blueprint import layout
 from viewer.books import BYTES, COUNTERS, Books
-from viewer.columns import GAP, Seam, runs, slug, vehicle_path
+from viewer.columns import GAP, TRAJECTORY, Seam, estimate_path, runs, slug, vehicle_path
 from viewer.drawing import Drawing, Group
 from viewer.sink import Sink, claim
 from viewer.summary import Summary
@@ -55,9 +56,9 @@ def record(
     messages : iterable of Message
         Any kinds, several vehicles, several boot epochs.
     path : path
-        New file for everything; for everything but the windows if ``windows`` is given.
+        New file for everything; for everything but windows and reports if ``windows`` is given.
     windows : path, optional
-        New file for the windows: a layer of the same recording.
+        New file for windows and reports: a layer of the same recording.
     sortie : str
         Name, and recording id.
     completeness : str or callable
@@ -153,6 +154,8 @@ class Recorder:
             self._drawing.place(message)
             if isinstance(message, Window):
                 self._drawing.window(message)
+            elif isinstance(message, Report):
+                self._drawing.report(message)
             else:
                 group = self._group(message)
                 group.messages.append(message)
@@ -233,7 +236,8 @@ class Recorder:
             case ClockFit():
                 key, parent = ("clock", message.vehicle), f"{root}/clock"
             case Estimate():
-                key, parent, track = ("live", message.vehicle), f"{root}/est/live", Track(joins=True)
+                parent, track = estimate_path(message), Track(joins=True)
+                key = ("live", parent)
             case _:
                 component = message.source.partition("/")[2] or message.source
                 names = self._components.setdefault((message.vehicle, message.stream), {})
@@ -245,7 +249,8 @@ class Recorder:
                 if message.stream == "gnss":
                     track = Track(joins=False)
         if key not in self._groups:
-            quick = isinstance(message, (Estimate, Gnss, Event, StatusText, Mark))
+            quick = isinstance(message, (Gnss, Event, StatusText, Mark))
+            quick |= isinstance(message, Estimate) and message.model == TRAJECTORY  # others have many states
             self._groups[key] = Group(parent, [], Seam(self._gap), track, [0], quick)
         return self._groups[key]
 

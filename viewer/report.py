@@ -7,7 +7,24 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from viewer.summary import Clock, Summary, Vehicle, utc, verdict
+from viewer.columns import first
+from viewer.summary import Clock, Summary, Vehicle, verdict
+from viewer.text import duration, utc
+from viewer.worth import (
+    STATES,
+    Worth,
+    about,
+    channel_row,
+    doubts,
+    gaps,
+    headline,
+    loss,
+    parameter_row,
+    state_row,
+    states,
+    title,
+    wrong,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,7 +33,20 @@ if TYPE_CHECKING:
     from viewer.review import Review
 
 LINES = 40  # lines of the event log that a report repeats; all of them are in the recording
+REPORTS = 12  # reports up to which each is told in full
 _LEVELS = ("CRITICAL", "ERROR", "WARN", "INFO", "DEBUG")
+# Shorter than on the page, because a terminal may be narrow.
+_PARAMETERS = ("parameter", "value ± sigma", "prior", "gain", "z", "verdict")
+_CHANNELS = ("channel", "NIS", "band", "lag-1", "used/weak/rejected", "verdict")
+_VERDICTS = {
+    "consistent": "green",
+    "inconsistent": "red",
+    "over-confident": "red",
+    "cautious": "yellow",
+    "not white": "yellow",
+    "not observable": "dim",
+    "no data": "dim",
+}
 _COLOURS = {"CRITICAL": "bold red", "ERROR": "red", "WARN": "yellow", "DEBUG": "dim"}
 
 
@@ -54,15 +84,10 @@ def tell(review: Review, console: Console) -> None:
     _links(summary, console)
     if summary.windows:
         _windows(summary, console)
+    for found in summary.reports:
+        # In a long flight windows without a complaint would push everything else off the screen.
+        _report(found, console, whole=len(summary.reports) <= REPORTS or found.scope != "window" or bool(found.alarms))
     _events(review, console)
-
-
-def duration(seconds: float) -> str:
-    """A length of time for humans, e.g. ``3 min 12 s``."""
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def _plain(text: str) -> str:
@@ -115,8 +140,7 @@ def _vehicle(vehicle: Vehicle, console: Console) -> None:
             style="yellow",
             highlight=False,
         )
-    live = vehicle.live
-    if live is not None:
+    for live in vehicle.live:
         ratio = (
             f"NIS/dof {live.nis / live.dof:.2f}, {verdict(live.nis, live.dof)}"
             if live.dof
@@ -174,20 +198,24 @@ def _windows(summary: Summary, console: Console) -> None:
     scopes = ", ".join(sorted({w.scope for w in summary.windows}))
     known = {"window": "everything up to their closing", "sortie": "the whole boot epoch"}.get(scopes, scopes)
     columns = "window", "test point", "from", "length>", "closed", "NIS/dof>", "altitude>", "horiz.>"
-    table = _table(f"Windows, smoothed with {known}", *columns)
     several = len({w.vehicle for w in summary.windows}) > 1
-    for w in summary.windows:
-        table.add_row(
-            f"{f'v{w.vehicle} ' if several else ''}{w.boot}.{w.number}",
-            _plain(w.test_point) or "-",
-            utc(w.t0, date=False),
-            duration((w.t1 - w.t0) / 1e9),
-            w.reason,
-            f"{w.nis / w.dof:.2f}" if w.nis is not None and w.dof else "-",
-            _number(w.median_sigma_altitude, ".2f", " m"),
-            _number(w.median_sigma_horizontal, ".2f", " m"),
-        )
-    console.print(table)
+    models = sorted({w.model for w in summary.windows}, key=first)
+    for model in models:
+        whose = f" of the {_plain(model.replace('_', ' '))}" if len(models) > 1 else ""
+        table = _table(f"Windows{whose}, smoothed with {known}", *columns)
+        for w in summary.windows:
+            if w.model == model:
+                table.add_row(
+                    f"{f'v{w.vehicle} ' if several else ''}{w.boot}.{w.number}",
+                    _plain(w.test_point) or "-",
+                    utc(w.t0, date=False),
+                    duration((w.t1 - w.t0) / 1e9),
+                    w.reason,
+                    f"{w.nis / w.dof:.2f}" if w.nis is not None and w.dof else "-",
+                    _number(w.median_sigma_altitude, ".2f", " m"),
+                    _number(w.median_sigma_horizontal, ".2f", " m"),
+                )
+        console.print(table)
     verdicts = Counter(verdict(w.nis, w.dof) for w in summary.windows)
     innovations = ", ".join(f"{count} {word}" for word, count in verdicts.most_common())
     console.print("  altitude, horiz.: median standard deviations; NIS/dof is 1 if the model is right", highlight=False)
@@ -195,6 +223,42 @@ def _windows(summary: Summary, console: Console) -> None:
     late = sum(sum(w.late.values()) for w in summary.windows)
     if late:
         console.print(f"  {late} samples came too late for the estimate", highlight=False, style="yellow")
+
+
+def _report(found: Worth, console: Console, *, whole: bool) -> None:
+    colour = "bold red" if found.alarms else "yellow" if wrong(found) or found.findings else "green"
+    console.print(
+        f"[bold]{_plain(title(found))}[/bold]: [{colour}]{_plain(headline(found))}[/]\n  {_plain(about(found))}",
+        highlight=False,
+    )
+    for text in found.alarms:
+        console.print(f"  ! {_plain(text)}", style="bold red", highlight=False)
+    if not whole:
+        return
+    _rows("Parameters", _PARAMETERS, [(p.name, *parameter_row(p)[1:]) for p in found.parameters], console)
+    for text in doubts(found.parameters):
+        console.print(f"  {_plain(text)}", style="dim", highlight=False)
+    _rows("Channels", _CHANNELS, [(c.name, *channel_row(c)[1:]) for c in found.channels], console)
+    for text in doubts(found.channels):
+        console.print(f"  {_plain(text)}", style="dim", highlight=False)
+    _rows("Median sigma", STATES, [(s.name, *state_row(s)[1:]) for s in states(found)], console)
+    console.print(f"  without inertial data: {_plain(gaps(found))}\n  loss: {_plain(loss(found))}", highlight=False)
+    for text in found.findings:
+        console.print(f"  finding: {_plain(text)}", style="yellow", highlight=False)
+    console.print(f"  inputs and configuration: {found.digest[:16]}\n", style="dim", highlight=False)
+
+
+def _rows(head: str, columns: tuple[str, ...], rows: list[tuple[str, ...]], console: Console) -> None:
+    """A table that fits a narrow terminal: names without their words."""
+    if not rows:
+        return
+    words = {"parameter", "channel", "state", "verdict"}
+    table = _table(head, *(name if name in words else f"{name}>" for name in columns))
+    for row in rows:
+        *cells, last = map(_plain, row)
+        colour = _VERDICTS.get(last, "")
+        table.add_row(*cells, f"[{colour}]{last}[/]" if colour else last)
+    console.print(table)
 
 
 def _events(review: Review, console: Console) -> None:

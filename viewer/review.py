@@ -9,10 +9,25 @@ import numpy as np
 
 from telemetry.messages import Times
 from viewer.books import BYTES, COUNTERS
-from viewer.columns import role
+from viewer.columns import first, place
 from viewer.comparison import Difference, compare
 from viewer.reading import Reading, column
-from viewer.summary import Account, Boot, ByteAccount, Clock, Live, Sensor, Silence, Smoothed, Summary, Vehicle, finite
+from viewer.states import order
+from viewer.summary import (
+    Account,
+    Boot,
+    ByteAccount,
+    Clock,
+    Live,
+    Sensor,
+    Silence,
+    Smoothed,
+    Summary,
+    Vehicle,
+    finite,
+    read,
+)
+from viewer.worth import Worth
 
 __all__ = ["Difference", "Line", "Reading", "Review", "column", "compare", "review"]
 
@@ -66,7 +81,7 @@ def review(path: str | Path) -> Review:
         log = _log(reading)
         text = reading.constant("/__properties/sortie", "summary")
         if text is not None:
-            summary = msgspec.json.decode(text, type=Summary)
+            summary = read(text)
         else:
             summary = _rebuilt(reading, log)
             reading.remarks.append("the recording was not closed cleanly: what follows was counted from its data")
@@ -124,11 +139,18 @@ def _rebuilt(reading: Reading, log: list[Line]) -> Summary:
             summary.windows += [msgspec.json.decode(verdict, type=Smoothed) for verdict in verdicts]
         elif parts[1] == "boot":
             _boots(reading, entity, vehicle)
-        elif parts[1:] == ["est", "live", "nis"]:
+        elif parts[1] == "report":
+            _, texts = reading.column(entity, "report")
+            summary.reports += [msgspec.json.decode(told, type=Worth) for told in texts]
+        elif parts[1] == "est" and parts[-2:] == ["live", "nis"]:
             _live(reading, entity, vehicle)
         elif parts[1:] == ["clock", "offset"]:
             _clock(reading, entity, vehicle)
     summary.vehicles = [vehicles[number] for number in sorted(vehicles)]
+    for vehicle in vehicles.values():
+        vehicle.live.sort(key=lambda live: first(live.model))
+    summary.windows.sort(key=lambda w: (w.t1, w.vehicle, first(w.model)))
+    summary.reports.sort(key=lambda r: (r.t_rx, r.end))
     for vehicle in summary.vehicles:
         if vehicle.boots and vehicle.sensors:  # an epoch that nobody closed lasts as long as anything was measured
             vehicle.boots[-1].t1 = max(vehicle.boots[-1].t1, *(sensor.t1 for sensor in vehicle.sensors))
@@ -176,24 +198,28 @@ def _boots(reading: Reading, entity: str, vehicle: Vehicle) -> None:
 
 
 def _live(reading: Reading, entity: str, vehicle: Vehicle) -> None:
+    here = place(entity)
+    assert here is not None
     _, rows = reading.column(entity, "Scalars:scalars")
     real = np.isfinite(rows[:, 1])
     tested = real & np.isfinite(rows[:, 0]) & (rows[:, 1] > 0)
-    states = sorted(path.split("/")[-1] for path in reading.chunks if path.startswith(entity.removesuffix("nis")))
-    names = [name for name in states if name not in ("nis", "geodetic")]
+    found = (p for path in reading.chunks if (p := place(path)) is not None)
+    names = [p.name for p in found if p[:3] == here[:3] and p.name not in ("nis", "geodetic")]
     determined = np.zeros(0, bool)
     for name in names:
         _, values = reading.column(entity.removesuffix("nis") + name, "Measurements:values")
         known = np.isfinite(values)
         determined = known if not len(determined) else determined[: len(known)] & known[: len(determined)]
-    vehicle.live = Live(
-        model="",
-        names=sorted(names, key=lambda n: (not role(n), n)),
-        units=[],
-        rows=int(real.sum()),
-        determined=int(determined.sum()),
-        nis=float(rows[tested, 0].sum()),
-        dof=int(rows[tested, 1].sum()),
+    vehicle.live.append(
+        Live(
+            model=here.model,
+            names=sorted(names, key=order),
+            units=[],
+            rows=int(real.sum()),
+            determined=int(determined.sum()),
+            nis=float(rows[tested, 0].sum()),
+            dof=int(rows[tested, 1].sum()),
+        )
     )
 
 

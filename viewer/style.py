@@ -8,6 +8,7 @@ from typing import Any
 import rerun as rr
 
 from viewer.columns import role
+from viewer.states import words
 
 RAW = (150, 150, 150)
 RAW_SECOND = (105, 120, 105)
@@ -17,7 +18,14 @@ BETWEEN = ("window A", "window B")  # two states for windows without a name, so 
 
 _COLOURS = {"raw": RAW, "gnss": RAW, "live": LIVE, "window": SMOOTHED}
 _SAID = {"live": "live", "window": "smoothed"}
-_INSTRUMENTS = {"gnss": "GNSS", "altitude": "barometer", "attitude": "autopilot", "air_data": "air data", "imu": "IMU"}
+_INSTRUMENTS = {
+    "gnss": "GNSS",
+    "altitude": "barometer",
+    "attitude": "autopilot",
+    "air_data": "air data",
+    "flow_angles": "vane",
+    "imu": "IMU",
+}
 _QUANTITIES = {
     "velocity_north": "north velocity",
     "velocity_east": "east velocity",
@@ -30,12 +38,15 @@ _VECTORS = {
     ("gnss", "sigma"): ("horizontal position", "altitude", "velocity"),
     ("gnss", "position"): ("latitude", "longitude"),
 }
-_POINTS = {"altitude", "velocity_north", "velocity_east", "climb_rate", "roll", "pitch", "heading", "airspeed"}
+_POINTS = {
+    *("altitude", "velocity_north", "velocity_east", "climb_rate"),
+    *("roll", "pitch", "heading", "airspeed", "alpha", "beta"),
+}
 
 
 def quantity(name: str) -> str:
     """A state or quantity in words, e.g. "north velocity"."""
-    return _QUANTITIES.get(role(name), name.replace("_", " "))
+    return words(name) or _QUANTITIES.get(role(name), name.replace("_", " "))
 
 
 def sensor(stream: str, name: str) -> Any:

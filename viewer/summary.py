@@ -9,8 +9,10 @@ import numpy as np
 
 from telemetry.messages import Window
 from viewer.columns import role
+from viewer.text import utc
+from viewer.worth import Worth
 
-FORMAT = 1
+FORMAT = 2
 
 
 def finite(x: float) -> float | None:
@@ -81,7 +83,9 @@ class Clock(msgspec.Struct, kw_only=True):
 
 
 class Live(msgspec.Struct, kw_only=True):
-    """The live estimates of a vehicle: rows, rows with every state determined, and the sum of NIS over its scalars."""
+    """The live estimates of one model of a vehicle: rows, rows with every state determined, and the sum of NIS over its
+    scalars.
+    """
 
     model: str
     names: list[str]
@@ -100,7 +104,7 @@ class Vehicle(msgspec.Struct, kw_only=True):
     silences: list[Silence] = []
     sensors: list[Sensor] = []
     clocks: list[Clock] = []
-    live: Live | None = None
+    live: list[Live] = []
 
 
 class Account(msgspec.Struct, kw_only=True):
@@ -212,9 +216,26 @@ class Summary(msgspec.Struct, kw_only=True):
     accounts: list[Account] = []
     byte_accounts: list[ByteAccount] = []
     windows: list[Smoothed] = []
+    reports: list[Worth] = []
     events: dict[str, int] = {}
     age: Age | None = None
     alarms: list[str] = []
+
+
+def read(text: str) -> Summary:
+    """A summary from its JSON; the first format had one live account per vehicle.
+
+    Raises
+    ------
+    msgspec.ValidationError
+        If it is none.
+    """
+    found = msgspec.json.decode(text)
+    for vehicle in found.get("vehicles", []):
+        live = vehicle.get("live")
+        if not isinstance(live, list):
+            vehicle["live"] = [] if live is None else [live]
+    return msgspec.convert(found, Summary)
 
 
 def smoothed(window: Window) -> Smoothed:
@@ -310,9 +331,3 @@ def markdown(window: Smoothed) -> str:
             f"| inputs | `{window.digest[:16]}` |",
         ]
     )
-
-
-def utc(t: int, *, date: bool = True) -> str:
-    """A Unix time in ns as text, to a tenth of a second."""
-    text = str(np.datetime64(t // 100_000_000 * 100, "ms"))[:-2].replace("T", " ")
-    return text if date else text[11:]

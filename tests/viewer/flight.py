@@ -252,7 +252,7 @@ def links(vehicle: int = 1) -> list[m.Message]:
 
 def sliced(message: m.Message, rows: slice) -> m.Message:
     """Some rows of a message."""
-    if isinstance(message, m.Window):
+    if isinstance(message, (m.Window, m.Report)):
         return message
     parts = {
         name: value[rows]
@@ -268,7 +268,7 @@ def batched(messages: Iterable[m.Message], period: float) -> Iterator[m.Message]
     pieces: list[tuple[int, int, m.Message]] = []
     for order, message in enumerate(messages):
         slot = (message.t_rx - START) // round(period * 1e9)
-        if isinstance(message, m.Window):
+        if isinstance(message, (m.Window, m.Report)):
             pieces.append((int(slot[-1]), order, message))
             continue
         edges: Sequence[int] = [0, *(np.flatnonzero(np.diff(slot)) + 1).tolist(), len(slot)]
