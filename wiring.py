@@ -32,6 +32,17 @@ if TYPE_CHECKING:
 
 DISTRIBUTION = "sortie-telemetry"
 
+TOLD = (  # of a window: state, factor, unit for people
+    ("north", 1.0, "m"),
+    ("altitude", 1.0, "m"),
+    ("velocity_north", 1.0, "m/s"),
+    ("h", 1.0, "m"),
+    ("u", 1.0, "m/s"),
+    ("w", 1.0, "m/s"),
+    ("theta", 57.29578, "deg"),
+    ("phi", 57.29578, "deg"),
+)
+
 
 class Failure(Exception):
     """The work failed, for a reason that one line can tell."""
@@ -154,7 +165,7 @@ def watch(messages: Iterable[Message], tell: Callable[[str], None], *, every: bo
     """Pass messages on and say what an engineer would look up for; unless `every`, only warnings and test points."""
     import numpy as np
 
-    from telemetry.messages import Event, Window
+    from telemetry.messages import Event, Report, Window
 
     for message in messages:
         if isinstance(message, Event):
@@ -163,11 +174,20 @@ def watch(messages: Iterable[Message], tell: Callable[[str], None], *, every: bo
                     tell(f"{_clock(t)} {text}" if level == "info" else f"{_clock(t)} {level}: {text}")
         elif isinstance(message, Window) and (every or message.test_point):
             name = f"test point {message.test_point}" if message.test_point else f"window {message.number}"
+            told = [(what, scale, unit) for what, scale, unit in TOLD if what in message.names]
             sigma = ", ".join(
-                f"{message.names[i]} {np.median(message.std[:, i]):.2f} {message.units[i]}" for i in (0, 4, 1)
+                f"{what} {np.nanmedian(message.std[:, message.names.index(what)]) * scale:.2g} {unit}"
+                for what, scale, unit in told
             )
             seconds = (message.t[-1] - message.t[0]) * 1e-9
-            tell(f"{_clock(int(message.t[-1]))} {name}, {seconds:.1f} s, closed by {message.reason}; sigma: {sigma}")
+            model = message.model.replace("_", " ")
+            tell(
+                f"{_clock(int(message.t[-1]))} {name}, {model}, {seconds:.1f} s, closed by {message.reason}; "
+                f"sigma: {sigma}"
+            )
+        elif isinstance(message, Report) and message.alarms:
+            name = f"test point {message.test_point}" if message.test_point else message.scope
+            tell(f"{_clock(int(message.t[-1]))} ALARM: {name}: {'; '.join(message.alarms)}")
         yield message
 
 

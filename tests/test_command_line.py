@@ -66,7 +66,9 @@ def test_smooth_review_and_plot(log, tmp_path):
     assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
     found = json.loads(run("review", "out.rrd", "--json", cwd=tmp_path).stdout)
     assert found["closed"]
-    assert [w["reason"] for w in found["summary"]["windows"]] == ["mark", "end"]
+    windows = found["summary"]["windows"]
+    assert [w["reason"] for w in windows if w["model"] == "trajectory"] == ["mark", "end"]
+    assert [w["reason"] for w in windows if w["model"] == "flight_path"] == ["mark", "end"]
 
 
 def test_the_output_is_never_overwritten(log, tmp_path):
