@@ -2,8 +2,7 @@
 
 A start needs inertial samples fast enough to be integrated, a satellite velocity (mode P: an airspeed) and an attitude:
 a measured one, or level from the specific force while the vehicle neither turns nor accelerates; and a heading: a
-measured one, or the track of a vehicle that moves. At speed V an error of attitude costs V sigma^2 / 2 of velocity,
-which the filter can only mend while that is small beside the noise of the velocity measured.
+measured one, or the track of a vehicle that moves.
 """
 
 from __future__ import annotations
@@ -105,8 +104,7 @@ def find(samples: Samples, flight: FlightPath, airspeed: Floats) -> Start | str:
     else:
         return "no attitude, and turning or accelerating too much to level"
     v = velocity[fixed[-1]].copy() if len(fixed) else np.zeros(3)
-    down_known = not math.isnan(v[2])
-    v[2] = v[2] if down_known else 0.0
+    v[2] = 0.0 if math.isnan(v[2]) else v[2]
     track = math.hypot(v[0], v[1])
     if settings.mode == "P":
         psi = float(angles[2]) if math.isfinite(angles[2]) else 0.0
@@ -131,10 +129,6 @@ def find(samples: Samples, flight: FlightPath, airspeed: Floats) -> Start | str:
         body = speed * np.array([math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)])
     else:
         body = turn_back @ v
-        if not down_known:
-            sigma[1:4] = np.maximum(sigma[1:4], settings.prior_velocity)
-        turned = float(np.linalg.norm(v)) * max(settings.prior_attitude, float(sigma[names.index("psi")]))
-        sigma[2:4] = np.hypot(sigma[2:4], turned)
         if settings.mode == "G" and speed > max(15.0 * settings.airspeed, MOVING):
             alpha, beta = (_last(z[:, MEASURED + i]) for i in (1, 2))
             alpha = theta if math.isnan(alpha) else alpha  # level flight, as a rule

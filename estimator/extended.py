@@ -42,7 +42,7 @@ from estimator.kinematics import (
     observe_velocity,
     step,
 )
-from estimator.rotation import difference, euler, euler_jacobian, matrix, turn
+from estimator.rotation import difference, euler, euler_jacobian, exponential, matrix, turn
 from estimator.sweeps import state, terminal
 from estimator.ud import Array, Order, agee_turner, bierman, compiled, factor, mwgs, solve
 
@@ -368,7 +368,7 @@ def image(
 ) -> None:
     """Fill ``phi`` (n, n): rows are the named states in their own order, columns those of the factor.
 
-    Angles are Euler angles at the estimate ``x`` (n,) about ``q``, or rotations about body axes. ``w`` (160,) scratch.
+    Angles are Euler angles at the estimate ``x`` (n,) about ``q``, or rotations about body axes. ``w`` (200,) scratch.
     """
     n = x.size
     base = n - K
@@ -380,6 +380,16 @@ def image(
         for j in range(B):
             phi[i, base - B + j] = b[i, j]
     if euler_rows:
+        exponential(-x[base + 4], -x[base + 5], -x[base + 6], e)  # (u, v, w) = exp(-[a]x) V
+        v1 = e[0, 0] * x[base + 1] + e[0, 1] * x[base + 2] + e[0, 2] * x[base + 3]
+        v2 = e[1, 0] * x[base + 1] + e[1, 1] * x[base + 2] + e[1, 2] * x[base + 3]
+        v3 = e[2, 0] * x[base + 1] + e[2, 1] * x[base + 2] + e[2, 2] * x[base + 3]
+        for j in range(base - B, n):
+            t1, t2, t3 = phi[1, j], phi[2, j], phi[3, j]
+            a1, a2, a3 = phi[4, j], phi[5, j], phi[6, j]
+            phi[1, j] = e[0, 0] * t1 + e[0, 1] * t2 + e[0, 2] * t3 + v2 * a3 - v3 * a2
+            phi[2, j] = e[1, 0] * t1 + e[1, 1] * t2 + e[1, 2] * t3 + v3 * a1 - v1 * a3
+            phi[3, j] = e[2, 0] * t1 + e[2, 1] * t2 + e[2, 2] * t3 + v1 * a2 - v2 * a1
         turn(q, x[base + 4], x[base + 5], x[base + 6], now)
         euler(now, angles)
         euler_jacobian(angles[0], angles[1], e)
@@ -486,7 +496,7 @@ def forward(
     tail = base - B
     iterated = about.w.shape[0] > 0
     ut, d, s, x, q, a, b = carry.ut, carry.d, carry.s, carry.x, carry.q, carry.a, carry.b
-    work, x1, q1, nominal = np.empty(160), np.empty(STATES), np.empty(4), np.empty(4)
+    work, x1, q1, nominal = np.empty(200), np.empty(STATES), np.empty(4), np.empty(4)
     phi7, b6, u = np.empty((K, K)), np.empty((K, B)), np.empty(6)
     a_new, b_new = np.empty((K, K)), np.empty((K, B))
     lu, order = np.empty((K, K)), np.empty(K, np.int64)
@@ -512,6 +522,10 @@ def forward(
             nominal[:] = about.q[i + 1]
             difference(nominal, q1, residual)
             q1[:] = nominal
+            exponential(residual[0], residual[1], residual[2], r33)
+            t1, t2, t3 = x1[1], x1[2], x1[3]
+            for j in range(3):
+                x1[1 + j] = r33[j, 0] * t1 + r33[j, 1] * t2 + r33[j, 2] * t3
             for j in range(K):
                 t = x1[j] if j < 4 else residual[j - 4]
                 for c in range(B):
@@ -745,9 +759,9 @@ def backward(
     tail = base - B
     flat = star.reshape(n)
     lu, order, pair = np.empty((K, K)), np.empty(K, np.int64), np.empty((K, 2))
-    mean, e, k, weight, work = np.empty(n), np.zeros(n), np.empty(n), np.empty(n), np.empty(160)
+    mean, e, k, weight, work = np.empty(n), np.zeros(n), np.empty(n), np.empty(n), np.empty(200)
     full, u, image_u = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    kin, moved = np.empty((K, n)), np.empty((K, n))
+    kin, moved, e33 = np.empty((K, n)), np.empty((K, n)), np.empty((3, 3))
     unit_a, unit_b = np.zeros((K, K)), np.zeros((K, B))
     for i in range(K):
         unit_a[i, i] = 1.0
@@ -766,6 +780,9 @@ def backward(
         for j in range(n):
             x[i, model.order[j]] = mean[j]
         turn(nominal, mean[base + 4], mean[base + 5], mean[base + 6], q[i])
+        exponential(-x[i, 4], -x[i, 5], -x[i, 6], e33)
+        for j in range(3):
+            x[i, 1 + j] = e33[j, 0] * mean[base + 1] + e33[j, 1] * mean[base + 2] + e33[j, 2] * mean[base + 3]
         x[i, 4] = x[i, 5] = x[i, 6] = 0.0
         if factors and shown[i]:
             if fresh:
@@ -855,12 +872,14 @@ def named(model: Model, x: Array, q: Array, rotated: bool, out: Array) -> None:
     """
     n = out.shape[1]
     base = n - K
-    now, angles = np.empty(4), np.empty(3)
+    now, angles, e = np.empty(4), np.empty(3), np.empty((3, 3))
     for i in range(out.shape[0]):
         if rotated:
             turn(q[i], x[i, base + 4], x[i, base + 5], x[i, base + 6], now)
-            for j in range(K):
-                out[i, j] = x[i, base + j]
+            exponential(-x[i, base + 4], -x[i, base + 5], -x[i, base + 6], e)
+            out[i, 0] = x[i, base]
+            for j in range(3):
+                out[i, 1 + j] = e[j, 0] * x[i, base + 1] + e[j, 1] * x[i, base + 2] + e[j, 2] * x[i, base + 3]
             for j in range(B):
                 out[i, K + j] = x[i, base - B + j]
             for j in range(base - B):

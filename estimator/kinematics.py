@@ -4,7 +4,7 @@ Nothing aerodynamic is in it: specific force and angular rate are measured, and 
 are those of the point where the inertial sensors stand, so no angular acceleration is needed anywhere::
 
     0      h            height, up, m                       13, 14  W_N, W_E       slow mean wind, m/s
-    1-3    u, v, w      velocity, body axes, m/s            15-17   T_N, T_E, T_D  turbulence, m/s
+    1-3    V            velocity, see below, m/s            15-17   T_N, T_E, T_D  turbulence, m/s
     4-6    a            small rotation about body axes,     18      kV             airspeed scale error
                         rad, from the nominal attitude q    19, 20  b_alpha, b_beta    vane offsets, rad
     7-9    ba           accelerometer bias, m/s2            21, 22  k_alpha, k_beta    vane slopes
@@ -14,10 +14,13 @@ The equations, with R = R(q) exp([a]x), f = f_m - ba, omega = omega_m - bg, e = 
 
     h' = -(R v)_D     v' = f + R^T (0, 0, g(h)) - (omega + e) x v     R' = R [omega - R^T (om_ie + om_en)]x
 
-the transport rate om_en cancels in v'. Shi's eq. (16) is the case without Earth rate, Earth radius and wind. The
-attitude is an error vector about a nominal quaternion, not Euler angles: a step and its Jacobian are regular at any
-pitch. Where a state is known to be x with rotation a, the next step begins by moving a into q, and says so in its
-Jacobian.
+the transport rate om_en cancels in v'. Shi's eq. (16) is the case without Earth rate, Earth radius and wind.
+
+The attitude is an error vector about a nominal quaternion, not Euler angles: a step and its Jacobian are regular at any
+pitch. The velocity is kept along the nominal axes, V = exp([a]x) (u, v, w): R(q) V is the velocity over ground whatever
+a is, so a satellite velocity says nothing about an attitude that no acceleration has shown. With (u, v, w) as the state
+an uncertain heading at high speed makes a filter believe what it cannot know (V sigma^2 / 2 against the noise). Where
+a state is known to be x with rotation a, the next step begins by moving a into q, and says so in its Jacobian.
 
 References
 ----------
@@ -26,6 +29,8 @@ References
 .. [2] P. D. Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems", 2nd ed., Artech
    House, 2013, sections 2.4 and 5.4.
 .. [3] F. L. Markley, "Attitude error representations for Kalman filtering", J. Guidance 26 (2003) 311-317.
+.. [4] A. Barrau, S. Bonnabel, "The invariant extended Kalman filter as a stable observer", IEEE Trans. Automatic
+   Control 62 (2017) 1797-1812.
 """
 
 from __future__ import annotations
@@ -159,8 +164,8 @@ def step(
     """One midpoint step from state ``x`` (>= 13,), whose rotation is about ``q`` (4,), driven by ``u`` (6,).
 
     Fills ``x1`` (>= 13,) with the next state, its rotation zero about the next nominal attitude ``q1`` (4,); ``phi``
-    (7, 7) and ``b`` (7, 6) with the exact Jacobian of the step by (h, v, a) and by the biases, which is also that by
-    the errors of ``u``. ``work`` (160,) is scratch. What is beyond the biases is left alone.
+    (7, 7) and ``b`` (7, 6) with the exact Jacobian of the step by (h, V, a) and by the biases, which is also that by
+    the errors of ``u``. ``work`` (200,) is scratch. What is beyond the biases is left alone.
     """
     r, rm = work[0:9].reshape(3, 3), work[9:18].reshape(3, 3)
     f, w, now, mid = work[18:21], work[21:24], work[24:28], work[28:32]
@@ -169,11 +174,13 @@ def step(
     half, jh = work[95:104].reshape(3, 3), work[104:113].reshape(3, 3)
     whole, jw = work[113:122].reshape(3, 3), work[122:131].reshape(3, 3)
     chart, line = work[131:140].reshape(3, 3), work[140:147]
+    back, v = work[147:156].reshape(3, 3), work[156:159]
     turn(q, x[4], x[5], x[6], turned)
     right_jacobian(x[4], x[5], x[6], chart)
+    exponential(-x[4], -x[5], -x[6], back)
     for i in range(3):
         f[i], w[i] = u[i] - x[7 + i], u[3 + i] - x[10 + i]
-    v = x[1:4]
+        v[i] = back[i, 0] * x[1] + back[i, 1] * x[2] + back[i, 2] * x[3]
     matrix(turned, r)
     rates(r, x[0], v, f, w, earth, now)
     slopes(r, x[0], v, w, earth, s1)
@@ -215,9 +222,14 @@ def step(
             for c in range(3):
                 t += s2[i, 4 + c] * half[c, j]
             line[j] = dt * t
-        for j in range(3):
-            phi[i, 4 + j] = line[0] * chart[0, j] + line[1] * chart[1, j] + line[2] * chart[2, j]
         phi[i, i] += 1.0
+        a1, a2, a3 = phi[i, 1], phi[i, 2], phi[i, 3]  # (u, v, w) = V + V x a: row . [V]x = row x V
+        line[0] += a2 * v[2] - a3 * v[1]
+        line[1] += a3 * v[0] - a1 * v[2]
+        line[2] += a1 * v[1] - a2 * v[0]
+        for j in range(3):
+            phi[i, 1 + j] = a1 * back[0, j] + a2 * back[1, j] + a3 * back[2, j]
+            phi[i, 4 + j] = line[0] * chart[0, j] + line[1] * chart[1, j] + line[2] * chart[2, j]
         for j in range(3):
             b[i, j] = -dt * k * s2[i, 1 + j]
             t = 0.0
@@ -244,6 +256,17 @@ def step(
             phi[4 + i, 4 + j] = whole[i, 0] * chart[0, j] + whole[i, 1] * chart[1, j] + whole[i, 2] * chart[2, j]
             b[4 + i, j] = 0.0
             b[4 + i, 3 + j] = -dt * jw[i, j]
+    v1, v2, v3 = x1[1], x1[2], x1[3]  # V = (u, v, w) + a x (u, v, w)
+    for j in range(4, 7):
+        t1, t2, t3 = phi[4, j], phi[5, j], phi[6, j]
+        phi[1, j] += t2 * v3 - t3 * v2
+        phi[2, j] += t3 * v1 - t1 * v3
+        phi[3, j] += t1 * v2 - t2 * v1
+    for j in range(3, 6):
+        t1, t2, t3 = b[4, j], b[5, j], b[6, j]
+        b[1, j] += t2 * v3 - t3 * v2
+        b[2, j] += t3 * v1 - t1 * v3
+        b[3, j] += t1 * v2 - t2 * v1
 
 
 @compiled
@@ -290,9 +313,10 @@ def observe_air(x: Array, r: Array, w: Array, vane: Array, y: Array, h: Array, w
         b1, b2, b3 = g[i, 0] + k * gr[i, 0], g[i, 1] + k * gr[i, 1], g[i, 2] + k * gr[i, 2]
         h[i, 1], h[i, 2], h[i, 3] = b1, b2, b3
         # by the rotation: d(R^T c)/da = [R^T c]x, and row . [c]x = row x c
-        h[i, 4] = -(b2 * s3 - b3 * s2) - (g[i, 1] * t3 - g[i, 2] * t2)
-        h[i, 5] = -(b3 * s1 - b1 * s3) - (g[i, 2] * t1 - g[i, 0] * t3)
-        h[i, 6] = -(b1 * s2 - b2 * s1) - (g[i, 0] * t2 - g[i, 1] * t1)
+        v1, v2, v3 = x[1] - s1, x[2] - s2, x[3] - s3
+        h[i, 4] = b2 * v3 - b3 * v2 - (g[i, 1] * t3 - g[i, 2] * t2)
+        h[i, 5] = b3 * v1 - b1 * v3 - (g[i, 2] * t1 - g[i, 0] * t3)
+        h[i, 6] = b1 * v2 - b2 * v1 - (g[i, 0] * t2 - g[i, 1] * t1)
         h[i, 10] = b2 * vane[2] - b3 * vane[1]
         h[i, 11] = b3 * vane[0] - b1 * vane[2]
         h[i, 12] = b1 * vane[1] - b2 * vane[0]
@@ -317,13 +341,13 @@ def observe_attitude(q: Array, y: Array, h: Array, work: Array) -> None:
 @compiled
 def observe_velocity(x: Array, r: Array, w: Array, antenna: Array, y: Array, h: Array) -> None:
     """North, east and down velocity of the antenna: fills ``y`` (3,) and ``h`` (3, 23)."""
-    c1 = x[1] + w[1] * antenna[2] - w[2] * antenna[1]
-    c2 = x[2] + w[2] * antenna[0] - w[0] * antenna[2]
-    c3 = x[3] + w[0] * antenna[1] - w[1] * antenna[0]
+    c1 = w[1] * antenna[2] - w[2] * antenna[1]
+    c2 = w[2] * antenna[0] - w[0] * antenna[2]
+    c3 = w[0] * antenna[1] - w[1] * antenna[0]
     h[:, :] = 0.0
     for i in range(3):
         r1, r2, r3 = r[i, 0], r[i, 1], r[i, 2]
-        y[i] = r1 * c1 + r2 * c2 + r3 * c3
+        y[i] = r1 * (x[1] + c1) + r2 * (x[2] + c2) + r3 * (x[3] + c3)
         h[i, 1], h[i, 2], h[i, 3] = r1, r2, r3
         h[i, 4], h[i, 5], h[i, 6] = -(r2 * c3 - r3 * c2), -(r3 * c1 - r1 * c3), -(r1 * c2 - r2 * c1)
         h[i, 10] = r2 * antenna[2] - r3 * antenna[1]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimator import extended
 from estimator.extended import About, Carry, Drive, Rows, Told
 from estimator.models.flight_path import FlightPath
-from estimator.rotation import difference
+from estimator.rotation import difference, exponential
 
 Floats = NDArray[np.float64]
 
@@ -171,6 +171,9 @@ class Stretch:
         carry = blocks[0].begin.copy()
         turned = np.empty(3)
         difference(found.q[0], carry.q, turned)
+        rotation = np.empty((3, 3))
+        exponential(turned[0], turned[1], turned[2], rotation)
+        carry.s[n - 6 : n - 3] = rotation @ carry.s[n - 6 : n - 3]
         carry.s[n - 3 :] = turned
         carry.q[:] = found.q[0]
         again, first = [], 0

@@ -98,7 +98,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     accelerometer_walk: NotNegative = 0.006
     gyro_walk: NotNegative = 4e-4
     imu_input: Literal["mean", "point"] = "mean"
-    airspeed: Positive = 0.5
+    airspeed: Positive = 0.8
     airspeed_scale: Positive = 0.05
     flow_angle: Positive = 1.0 * DEGREE
     flow_offset: Positive = 2.0 * DEGREE
@@ -258,9 +258,6 @@ class FlightPath(NamedTuple):
         n, order = self.n, self.model.order
         named = np.square(self.prior() if sigma is None else sigma)
         covariance = np.diag(named)
-        if sigma is None and self.settings.mode != "P":
-            turned = abs(values.get("u", 0.0)) * self.settings.prior_attitude
-            covariance[2, 2] = covariance[3, 3] = (self.settings.prior_velocity + turned) ** 2
         e = np.empty((3, 3))
         euler_jacobian(theta, phi, e)
         inverse = np.linalg.inv(e)

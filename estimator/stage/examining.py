@@ -11,7 +11,6 @@ from estimator.kinematics import ATTITUDE as ANGLES
 from estimator.kinematics import Earth
 from estimator.models.flight_path import Settings
 from estimator.stage.rows import AIR, ALTITUDE, ATTITUDE, FIX_VELOCITY, FLOW, GNSS, HEIGHT_COLUMN, INERTIAL
-from estimator.suspicion import Finding
 from estimator.synchronise import Rows
 
 Floats = NDArray[np.float64]
@@ -47,10 +46,20 @@ class Examiner:
             if len(mine):
                 self._kept[sensor].append((samples.t[mine], samples.z[np.ix_(mine, columns)]))
 
-    def findings(self, first: int, stop: int, delay: float) -> list[Finding]:
-        """What is wrong with the sensors from time `first` to `stop`, ns, fixes being taken as `delay` s old."""
+    def findings(self, first: int, stop: int, taken: float) -> tuple[str, ...]:
+        """What is wrong with the sensors from time `first` to `stop`, ns, in words.
+
+        ``taken`` is the delay of the fixes that was taken off, s, configured or found.
+        """
         columns, gravity = self._columns(first, stop)
-        return suspicion.examine(columns, gravity=gravity, gnss_delay=delay, gnss_arm=self._settings.antenna)
+        configured = self._settings.gnss_delay or 0.0
+        found = suspicion.examine(columns, gravity=gravity, gnss_delay=configured, gnss_arm=self._settings.antenna)
+        return tuple(
+            f"{finding.text} ({taken:.3f} s were taken off here)"
+            if finding.defect == "delay" and taken != configured
+            else finding.text
+            for finding in found
+        )
 
     def delay(self) -> float:
         """By how much the satellite fixes are older than they say, s; 0 where that is not certain."""

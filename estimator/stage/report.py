@@ -104,7 +104,6 @@ def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: S
         if parameter.value is not None and parameter.sigma is not None:
             epoch.found.setdefault(parameter.name, []).append((parameter.value, parameter.sigma))
     told = channels(window.tallies)
-    raw = leg.examiner.findings(int(t[0]), int(t[-1]), leg.delay)
     return Report(
         vehicle=epoch.vehicle,
         source=STAGE,
@@ -122,7 +121,7 @@ def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: S
         gaps={"interpolated": window.bridged} if window.bridged else {},
         loss=leg.examiner.loss(int(t[0]), int(t[-1])),
         loss_effect={},
-        findings=tuple(finding.text for finding in raw),
+        findings=leg.examiner.findings(int(t[0]), int(t[-1]), leg.delay),
         alarms=alarms(told),
         digest=window.digest.hexdigest(),
     )
@@ -191,7 +190,7 @@ class Sum:
             gaps={name: seconds for name, seconds in gaps.items() if seconds},
             loss=leg.examiner.loss(-(1 << 62), 1 << 62),
             loss_effect={},
-            findings=tuple(f.text for f in leg.examiner.findings(-(1 << 62), 1 << 62, leg.delay)),
+            findings=leg.examiner.findings(-(1 << 62), 1 << 62, leg.delay),
             alarms=alarms(told),
             digest=self._digest.hexdigest(),
         )
