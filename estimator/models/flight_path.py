@@ -98,7 +98,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     accelerometer_walk: NotNegative = 0.006
     gyro_walk: NotNegative = 4e-4
     imu_input: Literal["mean", "point"] = "mean"
-    airspeed: Positive = 0.8
+    airspeed: Positive = 1.0
     airspeed_scale: Positive = 0.05
     flow_angle: Positive = 1.0 * DEGREE
     flow_offset: Positive = 2.0 * DEGREE
@@ -145,6 +145,10 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             "prior_attitude": 1.0 * DEGREE, "prior_heading": 0.2 * DEGREE, "wind_walk": 0.02,
         }  # fmt: skip
         return cls(**{**grade, **changes})  # type: ignore[arg-type]
+
+
+GRADES = {"autopilot": Settings, "mems": Settings.mems, "fti": Settings.fti}
+"""Settings to begin from, by name."""
 
 
 class FlightPath(NamedTuple):
@@ -201,12 +205,21 @@ class FlightPath(NamedTuple):
             settings, tuple(ALL_NAMES[i] for i in told), tuple(ALL_UNITS[i] for i in told), model, 6 + len(driven)
         )
 
-    def noise(self, dt: Floats, inertial: Floats) -> tuple[Floats, Floats]:
+    def noise(self, dt: Floats, inertial: Floats, slow: Floats | None = None) -> tuple[Floats, Floats]:
         """Variances q (N, p) of the noise components and exp(-dt/tau) (N,) of steps dt (N,), s.
 
-        ``inertial`` (N, 6): variances of the mean specific force and rate of each step.
+        Parameters
+        ----------
+        dt : (N,) array
+        inertial : (N, 6) array
+            Variances of the mean specific force and rate of each step.
+        slow : (N,) array, optional
+            For how much time wind and biases walk in each step, s: zero in most, because a component without noise
+            costs nothing, and a wind that steps by a centimetre per second five times a second is as good as one that
+            walks. dt if not given.
         """
         s = self.settings
+        slow = dt if slow is None else slow
         fade = np.exp(-dt / s.turbulence_time)
         q = np.empty((len(dt), self.p))
         q[:, :6] = inertial
@@ -215,11 +228,11 @@ class FlightPath(NamedTuple):
             q[:, 6:9] = (max(s.turbulence, 0.01) ** 2 * -np.expm1(-2.0 * dt / s.turbulence_time))[:, None]
             at = 9
         if s.mode == "G":
-            q[:, 9:11] = (s.wind_walk**2 * dt)[:, None]
+            q[:, 9:11] = (s.wind_walk**2 * slow)[:, None]
             at = 11
         if self.p > at:
-            q[:, at : at + 3] = (s.accelerometer_walk**2 * dt)[:, None]
-            q[:, at + 3 : at + 6] = (s.gyro_walk**2 * dt)[:, None]
+            q[:, at : at + 3] = (s.accelerometer_walk**2 * slow)[:, None]
+            q[:, at + 3 : at + 6] = (s.gyro_walk**2 * slow)[:, None]
         return q, fade
 
     def prior(self) -> Floats:
