@@ -15,15 +15,17 @@ A sortie folder::
 from __future__ import annotations
 
 import os
+import queue
 import signal
 import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from telemetry.marks import Point
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from viewer.summary import Summary
 
 DISTRIBUTION = "sortie-telemetry"
+Item = TypeVar("Item")
 
 TOLD = (  # of a window: state, factor, unit for people
     ("north", 1.0, "m"),
@@ -54,7 +57,11 @@ def say(text: str) -> None:
 
 
 def configure(path: Path | None) -> Any:
-    """Settings of the stages, from a TOML file with the tables [ingest] and [estimate]."""
+    """Settings of the stages, from a TOML file with the tables [ingest] and [estimate].
+
+    A ``grade`` in [estimate.flight_path] stands for all settings of that grade of sensors; what is given beside it
+    replaces one of them.
+    """
     import msgspec
 
     import estimator.stage
@@ -73,11 +80,67 @@ def configure(path: Path | None) -> Any:
     if path is None:
         return kind()
     try:
-        configuration: Any = msgspec.toml.decode(path.read_bytes(), type=kind)
+        told = msgspec.toml.decode(path.read_bytes())
+        flight = told.get("estimate", {}).get("flight_path", {})
+        if "grade" in flight:
+            told["estimate"]["flight_path"] = _graded(flight)
+        configuration: Any = msgspec.convert(told, type=kind)
         check_mark(configuration.ingest.mark)
     except ValueError as error:  # msgspec's own are among them
         raise Failure(f"{path}: {error}") from None
     return configuration
+
+
+def ahead(stream: Iterable[Item], depth: int = 64) -> Iterator[Item]:
+    """The items of a stream that is worked out in a thread of its own, at most `depth` of them in advance.
+
+    Compiled loops and the writer of recordings leave the interpreter to each other, so two cores are busy.
+    """
+    items: queue.Queue[tuple[bool, Any]] = queue.Queue(depth)
+    stop = threading.Event()
+
+    def put(entry: tuple[bool, Any]) -> None:
+        while not stop.is_set():
+            with suppress(queue.Full):
+                items.put(entry, timeout=0.1)
+                return
+
+    def work() -> None:
+        try:
+            for item in stream:
+                put((True, item))
+                if stop.is_set():
+                    return
+            put((False, None))
+        except BaseException as error:
+            put((False, error))
+
+    worker = threading.Thread(target=work, name="ahead", daemon=True)
+    worker.start()
+    try:
+        while True:
+            more, item = items.get()
+            if more:
+                yield item
+            elif item is not None:
+                raise item
+            else:
+                return
+    finally:
+        stop.set()
+        worker.join()
+
+
+def _graded(given: dict[str, Any]) -> dict[str, Any]:
+    """Settings of the flight path, with the grade they begin from filled in."""
+    import msgspec
+
+    from estimator.models.flight_path import GRADES
+
+    grade = given["grade"]
+    if grade not in GRADES:
+        raise ValueError(f"grade {grade!r} of [estimate.flight_path]: it is one of {', '.join(GRADES)}")
+    return _told(msgspec.to_builtins(GRADES[grade]())) | {key: value for key, value in given.items() if key != "grade"}
 
 
 def also(messages: Iterable[Message], stage: Callable[[Iterable[Message]], Iterable[Message]]) -> Iterator[Message]:
@@ -364,7 +427,9 @@ def smooth_log(
     configuration: Any,
     tell: Callable[[str], None] | None,
     through: Callable[[str, Iterable[Any]], Iterable[Any]] = lambda _, stream: stream,
+    overlap: bool = True,
     test_points: Sequence[Point] = (),
+    begun: Callable[[Any], object] | None = None,
 ) -> Summary:
     """Smooth a log, each boot as a whole, into one recording.
 
@@ -376,8 +441,12 @@ def smooth_log(
         Given a line for every warning and test point; None also hides the progress bar.
     through : callable
         Every stream that one stage hands to the next passes through it, with the stage's name.
+    overlap : bool
+        Estimate in one thread and write in another.
     test_points : sequence of Point
         Those to be marked beside what the log itself marks.
+    begun : callable, optional
+        Given every stretch of flight path that begins.
     """
     from functools import partial
 
@@ -399,8 +468,9 @@ def smooth_log(
         frames = through("read", source.batches())
         samples = through("decode", ingest(frames, source.links, dialect, configuration.ingest))
         samples = insert(samples, test_points) if test_points else samples
-        whole = partial(estimate, settings=configuration.estimate, scope="sortie")
+        whole = partial(estimate, settings=configuration.estimate, scope="sortie", begun=begun)
         messages = through("estimate", also(samples, whole))
+        messages = ahead(messages) if overlap else messages
         if tell:
             messages = watch(messages, lambda text: bar.console.out(text, highlight=False), every=False)
         properties = {

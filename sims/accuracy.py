@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimator.geodesy import TangentPlane
-from telemetry.messages import ClockFit, Estimate, Gnss, Message, Window
+from sims.states import truth_states
+from telemetry.messages import Attitude, ClockFit, Estimate, Gnss, Message, Window
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -20,9 +21,16 @@ QUANTITIES = {  # name -> states
     "altitude": ("altitude",),
     "horizontal velocity": ("velocity_north", "velocity_east"),
     "climb rate": ("climb_rate",),
+    "velocity u, v, w": ("u", "v", "w"),
+    "roll and pitch": ("phi", "theta"),
+    "heading": ("psi",),
 }
-UNITS = {"horizontal position": "m", "altitude": "m", "horizontal velocity": "m/s", "climb rate": "m/s"}
-SOURCES = ("raw GNSS", "live", "window by window", "whole sortie")
+UNITS = {
+    "horizontal position": "m", "altitude": "m", "horizontal velocity": "m/s", "climb rate": "m/s",
+    "velocity u, v, w": "m/s", "roll and pitch": "deg", "heading": "deg",
+}  # fmt: skip
+ANGLES = ("phi", "theta", "psi")
+SOURCES = ("raw", "live", "window by window", "whole sortie")
 
 
 class Accuracy:
@@ -44,8 +52,8 @@ class Accuracy:
         """Take a message of the live sortie."""
         if isinstance(message, ClockFit) and message.reference[-1] == "system_time":
             self._offset = round(float(message.offset[-1]) * 1e9)
-        elif isinstance(message, Gnss):
-            self._kept["raw GNSS"].append(message)
+        elif isinstance(message, Gnss | Attitude):
+            self._kept["raw"].append(message)
         elif isinstance(message, Estimate):
             self._kept["live"].append(message)
         elif isinstance(message, Window):
@@ -62,8 +70,8 @@ class Accuracy:
         """Per source and quantity the rms error and the share of errors within two standard deviations.
 
         A quantity that the source does not measure is missing; the rms of the stated standard deviations stands
-        beside the error. Errors are those of all components together; samples before the first complete estimate are
-        left out.
+        beside the error, None for both where none is stated. Errors are those of all components together, SI; samples
+        before the first complete estimate are left out.
         """
         if self._offset is None:
             raise ValueError("no UTC was heard from the vehicle: its estimates cannot be placed beside the truth")
@@ -82,7 +90,7 @@ class Accuracy:
             cells = []
             for source in figures:
                 found = figures[source].get(quantity)
-                cells.append(f"{found['rms']:.2f} ({found['coverage']:.0%})" if found else "not measured")
+                cells.append(_cell(found, 57.29578 if unit == "deg" else 1.0))
             table.add_row(f"{quantity}, {unit}", *cells)
         return table
 
@@ -93,19 +101,27 @@ class Accuracy:
             inside, truth = self._truth(message.t)
             for name, states in QUANTITIES.items():
                 for state in states:
-                    value, sigma = _value(message, state, self._plane)
-                    good = inside & np.isfinite(value) & np.isfinite(sigma)
-                    errors[name].append((value - truth[state])[good])
+                    found = _value(message, state, self._plane)
+                    if found is None:
+                        continue
+                    value, sigma = found
+                    good = inside & np.isfinite(value) & ~np.isinf(sigma)
+                    error = value - truth[state]
+                    if state in ANGLES:
+                        error = np.remainder(error + np.pi, 2.0 * np.pi) - np.pi
+                    errors[name].append(error[good])
                     sigmas[name].append(sigma[good])
         out: dict[str, dict[str, float | None]] = {}
         for name in QUANTITIES:
+            if not sum(len(part) for part in errors[name]):
+                continue
             error, sigma = np.concatenate(errors[name]), np.concatenate(sigmas[name])
-            if len(error):
-                out[name] = {
-                    "rms": float(np.sqrt(np.mean(error**2))),
-                    "sigma": float(np.sqrt(np.mean(sigma**2))),
-                    "coverage": float(np.mean(np.abs(error) <= 2 * sigma)),
-                }
+            stated = bool(np.isfinite(sigma).all())
+            out[name] = {
+                "rms": float(np.sqrt(np.mean(error**2))),
+                "sigma": float(np.sqrt(np.mean(sigma**2))) if stated else None,
+                "coverage": float(np.mean(np.abs(error) <= 2 * sigma)) if stated else None,
+            }
         return out
 
     @property
@@ -129,12 +145,28 @@ class Accuracy:
             "velocity_east": truth.velocity[:, 1],
             "climb_rate": -truth.velocity[:, 2],
         }
+        states = truth_states(self._flight)
+        columns |= {name: states[name] for name in ("u", "v", "w", "phi", "theta")} | {"psi": np.unwrap(states["psi"])}
         return inside, {name: np.interp(at, seconds, column) for name, column in columns.items()}
 
 
-def _value(message: Message, state: str, plane: TangentPlane) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """A state and its standard deviation as the message has them, positions on the truth's own plane."""
+def _cell(found: dict[str, float | None] | None, scale: float) -> str:
+    """Error and coverage of one quantity in words."""
+    if found is None or found["rms"] is None:
+        return "not measured"
+    coverage = "" if found["coverage"] is None else f" ({found['coverage']:.0%})"
+    return f"{found['rms'] * scale:.2f}{coverage}"
+
+
+def _value(
+    message: Message, state: str, plane: TangentPlane
+) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]] | None:
+    """A state and its standard deviation (NaN: not stated) as the message has them; places on the truth's plane."""
+    if isinstance(message, Attitude):
+        return (getattr(message, state), np.full(len(message.t), np.nan)) if state in ANGLES else None
     if isinstance(message, Gnss):
+        if state in ANGLES or state in ("u", "v", "w"):
+            return None
         latitude, longitude, altitude = message.latitude, message.longitude, message.altitude
         velocity = {
             "velocity_north": message.velocity[:, 0],
@@ -142,16 +174,17 @@ def _value(message: Message, state: str, plane: TangentPlane) -> tuple[np.ndarra
             "climb_rate": -message.velocity[:, 2],
         }
         sigma = message.sigma[:, 1 if state == "altitude" else 2 if state in velocity else 0]
+        if state in velocity:
+            return velocity[state], sigma
     else:
         assert isinstance(message, Estimate | Window)
+        if state not in message.names:
+            return None
+        column = message.names.index(state)
         latitude, longitude, altitude = message.geodetic.T
-        velocity = {
-            name: message.mean[:, message.names.index(name)]
-            for name in ("velocity_north", "velocity_east", "climb_rate")
-        }
-        sigma = message.std[:, message.names.index(state)]
-    if state in velocity:
-        return velocity[state], sigma
+        sigma = message.std[:, column]
+        if state not in ("north", "east", "altitude"):
+            return message.mean[:, column], sigma
     if state == "altitude":
         return altitude, sigma
     north, east = plane.to_plane(latitude, longitude, altitude)
