@@ -212,6 +212,7 @@ def smooth(
     output: Path | None = None,
     test_points: Path | None = None,
     config: Path | None = None,
+    bias_separation: bool = False,
     quiet: bool = False,
 ) -> None:
     """Smooth a log, each boot as a whole, into one recording.
@@ -226,6 +227,8 @@ def smooth(
         TOML or CSV file of test points (name, start, stop, vehicle), beside those that the log itself marks.
     config
         TOML file with settings.
+    bias_separation
+        Also estimate biases and scale errors beside the states, as in Shi's eq. (17), and print both.
     quiet
         Say nothing but the result.
     """
@@ -236,13 +239,45 @@ def smooth(
         from telemetry.marks import read
 
         points = read(test_points)
-    summary = smooth_log(log, output, configuration, None if quiet else say, test_points=points)
+    witness = _witness() if bias_separation else None
+    tell = None if quiet else say
+    summary = smooth_log(log, output, configuration, tell, test_points=points, begun=witness)
     print(
         f"{output}: {counted(len(summary.vehicles), 'vehicle')}, {counted(len(summary.windows), 'window')}, "
         f"{summary.completeness}"
     )
+    if witness is not None:
+        _separation(log, witness, tell)
     if not summary.windows:
         raise Failure(f"{log}: no satellite fix, so there is nothing to smooth; what could be read is in {output}")
+
+
+def _witness() -> Any:
+    from sims.experiments.separation import Witness
+
+    return Witness()
+
+
+def _separation(log: Path, witness: Any, tell: Callable[[str], None] | None) -> None:
+    """Print parameters among the states and beside them, for every stretch of flight path that was smoothed."""
+    from rich.console import Console
+
+    from sims.experiments.separation import compare
+
+    stretches = witness.steps()
+    if not stretches:
+        raise Failure(f"{log}: no flight path, so there are no biases to separate; its events say why")
+    console = Console(highlight=False, width=max(Console().width, 120))
+    for number, steps in enumerate(stretches, 1):
+        seconds = float(steps.drive.dt.sum())
+        console.print(f"\nstretch {number} of {len(stretches)}, mode {steps.flight.settings.mode}, {seconds:.1f} s")
+        try:
+            found = compare(steps, tell=tell)
+        except ArithmeticError as error:  # there is no gate here that would begin anew
+            console.print(f"not compared: {error}")
+            continue
+        console.print(found.table())
+        console.print(found.forms_table())
 
 
 def review(recording: Path, *, json: bool = False, plot: Path | None = None) -> None:
@@ -343,36 +378,82 @@ def sim(
     speed: float = 1.0,
     faults: str | None = None,
     seed: int = 1,
+    planet: Literal["wgs84", "flat"] = "wgs84",
+    wind: tuple[float, float] = (-3.0, 4.0),
+    turbulence: int = 0,
+    gnss_delay: float = 0.0,
+    dropout: list[str] | None = None,
     truth: Path | None = None,
 ) -> None:
-    """Fly a simulated aircraft that speaks MAVLink over UDP.
+    """Fly a simulated aircraft: MAVLink over UDP, a log, or arrays.
 
     Parameters
     ----------
     aircraft
         A JSBSim aircraft.
     to
-        udpout:HOST:PORT.
+        udpout:HOST:PORT; or a file: NAME.tlog, or NAME.npz with everything in arrays, truth and sensors.
     manoeuvre
         The flight plan.
     sensors
-        mems or fti.
+        mems, mems-vanes or fti.
     speed
-        Times real time.
+        Times real time, on a socket.
     faults
         What the link does, e.g. loss=0.02,outage=60:5.
     seed
         The same seed flies the same flight, bit for bit.
+    planet
+        wgs84, or flat: a plane at rest.
+    wind
+        Steady wind, north and east, the way the air moves, m/s.
+    turbulence
+        0 (calm) to 7.
+    gnss_delay
+        By how much satellite fixes are late, s.
+    dropout
+        SENSOR:START:STOP in s, e.g. gnss:20:30; may be given again.
     truth
         Write the truth there, an .npz file.
     """
     import sims
 
-    flight = sims.fly(aircraft, manoeuvre, sensors=sensors, seed=seed)
+    late = {"gnss": gnss_delay} if gnss_delay else None
+    dropouts = [_dropout(text) for text in dropout or ()]
+    flight = sims.fly(
+        aircraft,
+        manoeuvre,
+        sensors=sensors,
+        seed=seed,
+        planet=planet,
+        wind=wind,
+        turbulence=turbulence,
+        latencies=late,
+        dropouts=dropouts,
+    )
     if truth:
         flight.truth.save(truth)
-    sent = sims.send(sims.frames(flight), to, speed=speed, faults=faults)
-    print(f"{sent.flown:.1f} s of flight, {counted(sent.datagrams, 'frame')} to {to} in {sent.took:.1f} s")
+    if to.endswith(".npz"):
+        flight.save(to)
+        print(f"{to}: {(flight.truth.t[-1] - flight.truth.t[0]) * 1e-9:.1f} s of flight, truth and sensors")
+    elif to.endswith(".tlog"):
+        from sims.faults import apply
+
+        count = sims.write_tlog(apply(sims.frames(flight), faults)[0], to, flight.start_utc)
+        print(f"{to}: {counted(count, 'frame')}")
+    else:
+        sent = sims.send(sims.frames(flight), to, speed=speed, faults=faults)
+        print(f"{sent.flown:.1f} s of flight, {counted(sent.datagrams, 'frame')} to {to} in {sent.took:.1f} s")
+
+
+def _dropout(text: str) -> tuple[str, float, float]:
+    """A sensor and the time it is silent, from SENSOR:START:STOP."""
+    sensor, *times = text.split(":")
+    try:
+        start, stop = (float(time) for time in times)
+    except ValueError:
+        raise ValueError(f"--dropout {text}: SENSOR:START:STOP is needed, seconds from the start") from None
+    return sensor, start, stop
 
 
 def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED) -> None:
@@ -471,8 +552,11 @@ def bench_smooth(log: Path | None = None) -> None:
         smooth_log(log, Path(folder) / "warm.rrd", None, None)
         spent = dict.fromkeys(spent, 0.0)
         begin = time.perf_counter()
-        summary = smooth_log(log, Path(folder) / "out.rrd", None, None, through)
+        summary = smooth_log(log, Path(folder) / "out.rrd", None, None, through=through, overlap=False)
         total = time.perf_counter() - begin
+        begin = time.perf_counter()
+        smooth_log(log, Path(folder) / "again.rrd", None, None)
+        overlapped = time.perf_counter() - begin
         size = log.stat().st_size
         written = (Path(folder) / "out.rrd").stat().st_size
     # Each stage pulls from the one before, so its time holds that of the one before.
@@ -488,6 +572,7 @@ def bench_smooth(log: Path | None = None) -> None:
         rate = frames / max(seconds, 1e-9) / 1e3
         print(f"  {stage:9} {seconds:7.3f} s  {100 * seconds / total:5.1f} %  {rate:8.0f} k frames/s")
     print(f"  {'all':9} {total:7.3f} s  100.0 %  {frames / total / 1e3:8.0f} k frames/s")
+    print(f"  {'overlapped':10} {overlapped:6.3f} s   estimating and writing at the same time, as sortie smooth does")
 
 
 def reproduce_shi(*, json: bool = False) -> None:
@@ -592,6 +677,63 @@ def bench_extended(*, steps: int = 3000, rounds: int = 7, json: bool = False) ->
     Console(highlight=False, width=max(Console().width, 130)).print(found.table())
 
 
+def bench_truth(*, seeds: int = 10, quick: bool = False, json: bool = False) -> None:
+    """How accurate the flight path is in simulation, how honest its error bars, and which targets that meets.
+
+    Aircraft x manoeuvres x sensors x air; every draw has gusts and sensor errors of its own. Takes minutes.
+
+    Parameters
+    ----------
+    seeds
+        Draws of every case in gusts; half as many in calm air.
+    quick
+        Two aircraft, one plan, three draws.
+    json
+        Print JSON instead of tables.
+    """
+    import msgspec
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from sims.experiments.truth_table import QUICK, Plan, compare
+
+    plan = QUICK if quick else Plan(seeds=seeds)
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("flying and reconstructing", total=None)
+        found = compare(plan, progress=lambda done, of: bar.update(task, completed=done, total=of))
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+        return
+    console = Console(highlight=False, width=max(Console().width, 190))
+    for table in found.tables():
+        console.print(table)
+    console.print(f"{found.draws} flights, {found.took:.0f} s")
+
+
+def bench_withheld(*log: Path, json: bool = False) -> None:
+    """Samples of a real flight withheld and predicted: satellite velocity and airspeed, beside interpolation.
+
+    Parameters
+    ----------
+    log
+        .tlog files with inertial samples at 20 Hz or more, satellite fixes and airspeed.
+    json
+        Print JSON instead of a table.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from sims.experiments.withheld import compare, table
+
+    if not log:
+        raise Failure("say which flight, e.g. sortie bench withheld flight.tlog")
+    found = compare(log, tell=say)
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+        return
+    Console(highlight=False, width=max(Console().width, 170)).print(table(found))
+
+
 COMMANDS: tuple[Callable[..., None], ...] = (
     demo,
     live,
@@ -610,6 +752,8 @@ BENCHMARKS: dict[str, Callable[..., None]] = {
     "linear": bench_linear,
     "extended": bench_extended,
     "long": bench_long,
+    "truth": bench_truth,
+    "withheld": bench_withheld,
 }
 REPRODUCTIONS: dict[str, Callable[..., None]] = {"shi": reproduce_shi}
 PURPOSE = "Turn the telemetry of a test flight into a trustworthy flight path while the aircraft still flies."
@@ -636,7 +780,7 @@ def _application() -> Any:
     smooth.__annotations__["output"] = Annotated[Path | None, Parameter(name=["--output", "-o"])]
     for command in COMMANDS:
         app.command(command)
-    bench = App(name="bench", help="Measure speed.", help_format="plaintext")
+    bench = App(name="bench", help="Measure speed and accuracy.", help_format="plaintext")
     for name, command in BENCHMARKS.items():
         bench.command(command, name=name)
     app.command(bench)

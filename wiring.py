@@ -140,7 +140,8 @@ def _graded(given: dict[str, Any]) -> dict[str, Any]:
     grade = given["grade"]
     if grade not in GRADES:
         raise ValueError(f"grade {grade!r} of [estimate.flight_path]: it is one of {', '.join(GRADES)}")
-    return _told(msgspec.to_builtins(GRADES[grade]())) | {key: value for key, value in given.items() if key != "grade"}
+    whole: dict[str, Any] = _told(msgspec.to_builtins(GRADES[grade]()))
+    return whole | {key: value for key, value in given.items() if key != "grade"}
 
 
 def also(messages: Iterable[Message], stage: Callable[[Iterable[Message]], Iterable[Message]]) -> Iterator[Message]:

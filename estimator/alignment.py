@@ -1,8 +1,9 @@
 """Where a flight path can begin, and with what: levelling, heading and wind from the last samples before it.
 
 A start needs inertial samples fast enough to be integrated, a satellite velocity (mode P: an airspeed) and an attitude:
-a measured one, or level from the specific force while the vehicle neither turns nor accelerates; and a heading: a
-measured one, or the track of a vehicle that moves.
+a measured one, or level from the specific force, less what turning and gaining speed add to it; and a heading: a
+measured one, or the track of a vehicle that moves. A measured attitude that is old, or far from level where level can
+be told, is not believed.
 """
 
 from __future__ import annotations
@@ -22,6 +23,11 @@ Floats = NDArray[np.float64]
 SLOWEST = 20.0  # Hz of inertial samples
 SPAN = 2.0  # s that are looked at
 STEADY = (0.1, 0.7)  # rad/s and m/s2: less than that is neither turning nor accelerating
+TURNING = 0.5  # rad/s: up to it level is told from the specific force less what the turn adds
+GAIN = 1.0  # m/s2 of speed: less than that is not taken off, because the fixes tell it no better
+UNSURE = math.radians(10.0)  # a level that is known no better is none
+FRESH = 500_000_000  # ns: an older attitude is none
+CONTRADICTION = math.radians(15.0)  # of a measured attitude and gravity
 MOVING = 5.0  # m/s: a track above it is a heading
 GUST = 3.0  # m/s: what a crosswind does to a track as a heading
 
@@ -41,6 +47,8 @@ class Start(NamedTuple):
         Usual time between inertial samples, s.
     text : str
         Where attitude and heading come from.
+    doubtful : bool
+        A sensor was not believed.
     """
 
     row: int
@@ -48,6 +56,7 @@ class Start(NamedTuple):
     sigma: Floats
     period: float
     text: str
+    doubtful: bool = False
 
 
 def rate(t: NDArray[np.int64]) -> float:
@@ -93,14 +102,27 @@ def find(samples: Samples, flight: FlightPath, airspeed: Floats) -> Start | str:
     height = _last(z[:, MEASURED + HEIGHT])
     if math.isnan(height):
         return "no altitude"
-    angles = np.array([_last(z[:, MEASURED + ATTITUDE + i]) for i in range(3)])
+    speed = _last(airspeed[recent])
+    level = _level(f, w, g, speed, samples.t[recent][fixed], velocity[fixed], settings.gyro_bias)
+    fresh = samples.t[recent] >= end - FRESH
+    angles = np.array([_last(z[fresh, MEASURED + ATTITUDE + i]) for i in range(3)])
     sigma = flight.prior()
     names = flight.names
-    if np.isfinite(angles[:2]).all():
+    known = bool(np.isfinite(angles[:2]).all()) and abs(angles[0]) < 1.6 and abs(angles[1]) < 6.4
+    doubtful = False
+    if known and level is not None:
+        between = _rotation(level[0], level[1], 0.0)[2] @ _rotation(float(angles[0]), float(angles[1]), 0.0)[2]
+        apart = math.acos(min(max(float(between), -1.0), 1.0))
+        doubtful = apart > max(CONTRADICTION, 3.0 * settings.prior_attitude) + 3.0 * level[2]
+    if known and not doubtful:
         theta, phi, source = float(angles[0]), float(angles[1]), "measured attitude"
-    elif float(np.linalg.norm(w)) < STEADY[0] and abs(float(np.linalg.norm(f)) - g) < STEADY[1]:
-        theta, phi = math.atan2(f[0], math.hypot(f[1], f[2])), math.atan2(-f[1], -f[2])
+    elif level is not None:
+        theta, phi, unsure = level
+        for name in ("theta", "phi"):
+            sigma[names.index(name)] = math.hypot(settings.prior_attitude, unsure)
         source = "level from the specific force"
+        if doubtful:
+            source += f" (the measured attitude is {math.degrees(apart):.0f} deg away and not believed)"
     else:
         return "no attitude, and turning or accelerating too much to level"
     v = velocity[fixed[-1]].copy() if len(fixed) else np.zeros(3)
@@ -118,7 +140,6 @@ def find(samples: Samples, flight: FlightPath, airspeed: Floats) -> Start | str:
         source += ", heading from the track"
     else:
         return "no heading, and too slow for a track"
-    speed = _last(airspeed[recent])
     turn_back = _rotation(theta, phi, psi).T
     values = {"h": height, "theta": theta, "phi": phi, "psi": psi}
     if settings.mode == "P":
@@ -138,7 +159,28 @@ def find(samples: Samples, flight: FlightPath, airspeed: Floats) -> Start | str:
             if math.hypot(wind[0], wind[1]) < 3.0 * settings.wind:
                 values["wind_north"], values["wind_east"] = float(wind[0]), float(wind[1])
     values.update(u=float(body[0]), v=float(body[1]), w=float(body[2]))
-    return Start(row, values, sigma, 1.0 / hertz, source)
+    return Start(row, values, sigma, 1.0 / hertz, source, doubtful)
+
+
+def _level(
+    f: Floats, w: Floats, g: float, airspeed: float, t: NDArray[np.int64], velocity: Floats, gyro_bias: float
+) -> tuple[float, float, float] | None:
+    """Pitch and roll from the specific force ``f``, and how much less sure they are in a turn; None in a manoeuvre.
+
+    What gaining speed adds is taken off, and in a turn the centripetal force: that of straight flight would be nothing
+    but the gyros' bias times the speed.
+    """
+    track = np.hypot(velocity[:, 0], velocity[:, 1])
+    gain = float((track[-1] - track[0]) / (1e-9 * (t[-1] - t[0]))) if len(track) > 1 else 0.0
+    felt = f - np.array([gain if abs(gain) > GAIN else 0.0, 0.0, 0.0])
+    turning, unsure = float(np.linalg.norm(w)), 0.0
+    if turning > STEADY[0]:
+        speed = airspeed if airspeed > MOVING else float(track[-1]) if len(track) else 0.0
+        felt = felt - np.array([0.0, w[2] * speed, -w[1] * speed])
+        unsure = gyro_bias * speed / g
+    if turning > TURNING or unsure > UNSURE or not abs(float(np.linalg.norm(felt)) - g) < STEADY[1]:
+        return None
+    return math.atan2(felt[0], math.hypot(felt[1], felt[2])), math.atan2(-felt[1], -felt[2]), unsure
 
 
 def true_airspeed(samples: Samples) -> Floats:

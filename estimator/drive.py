@@ -10,6 +10,7 @@ times; up to 2 s, it is interpolated with the variance of unknown manoeuvring, a
 
 from __future__ import annotations
 
+import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from estimator import atmosphere
 from estimator.extended import Drive
 from estimator.kinematics import ATTITUDE, HEIGHT, VELOCITY, M
 from estimator.models.flight_path import FlightPath
+from estimator.synchronise import Rows
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -26,6 +28,7 @@ Times = NDArray[np.int64]
 # Columns of a row of samples: inertial, then measurements as in ``kinematics``, then what the airspeed is made of.
 IMU, MEASURED, STATIC, IMPACT, WIDTH = 0, 6, 6 + M, 7 + M, 8 + M
 S = 1_000_000_000
+WALK = S // 5  # ns between two steps of what walks slowly
 LATE_SAMPLES, WEAK = 2.5, 4.0  # sample times that are held, and by how much that raises the variance
 LONGEST_GAP = 2.0  # s
 MANOEUVRE = (3.0, 0.4)  # m/s2 and rad/s: what an aircraft may do unseen
@@ -65,6 +68,39 @@ class Samples(NamedTuple):
         return cls(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, WIDTH)), np.empty((0, WIDTH)))
 
 
+def merged(samples: Samples, late: Rows) -> tuple[Samples, NDArray[np.bool_]]:
+    """Samples with others put in where they belong; what has been measured at the same time already stays.
+
+    Parameters
+    ----------
+    samples : Samples
+    late : Rows
+        In the order of their arrival, z and r as wide as those of the samples.
+
+    Returns
+    -------
+    samples : Samples
+    new : bool array
+        Which of `late` added anything.
+    """
+    t = np.unique(late.t)
+    t = t[~np.isin(t, samples.t)]
+    at = np.searchsorted(samples.t, t)
+    nothing = np.full((len(t), WIDTH), np.nan)
+    all_t = np.insert(samples.t, at, t)
+    t_rx = np.insert(samples.t_rx, at, np.zeros(len(t), np.int64))
+    z, r = np.insert(samples.z, at, nothing, axis=0), np.insert(samples.r, at, nothing, axis=0)
+    place = np.searchsorted(all_t, late.t)
+    added = np.zeros(len(late.t), np.bool_)
+    for i, k in enumerate(place.tolist()):  # few, and the first of two at one time counts
+        new = np.isnan(z[k]) & ~np.isnan(late.z[i])
+        if new.any():
+            added[i] = True
+            z[k, new], r[k, new] = late.z[i, new], late.r[i, new]
+            t_rx[k] = max(t_rx[k], late.t_rx[i])
+    return Samples(all_t, t_rx, z, r), added
+
+
 class Steps(NamedTuple):
     """What the filter is driven by, and the times that go with it.
 
@@ -81,6 +117,10 @@ class Steps(NamedTuple):
     t_rx: Times
     drive: Drive
     inertial: NDArray[np.bool_]
+
+    def part(self, stop: int) -> Steps:
+        """The first steps."""
+        return Steps(self.t[:stop], self.t_rx[:stop], self.drive.part(0, stop), self.inertial[:stop])
 
 
 class Driver:
@@ -105,12 +145,12 @@ class Driver:
         self, flight: FlightPath, t: int, u: Floats, period: float, *, output: int, attitude_interval: int
     ) -> None:
         self.flight, self.period = flight, period
-        self._t = self._imu_t = t
+        self._t = self._imu_t = self._walked = t
         self._u = u
         self._output, self._thin = output, attitude_interval
         self._pending: list[Samples] = []
         self._static = np.nan
-        self._last: dict[int, tuple[float, int]] = {}  # column -> last value and its time
+        self._said: dict[int, tuple[Floats, int]] = {}  # column -> what was said last, and when
         self._attitude = -(1 << 62)
         self.gap: int | None = None  # time of the last inertial sample before a gap that is too long
 
@@ -139,6 +179,16 @@ class Driver:
         last = int(ends[-1]) + 1
         self._pending = [rows.rows(slice(last, None))] if last < len(rows.t) else []
         return self._steps(rows.rows(slice(last)), ends, times, spans)
+
+    def copy(self) -> Driver:
+        """The same driver, to go on differently from here."""
+        other = copy.copy(self)
+        other._pending, other._said = list(self._pending), dict(self._said)
+        return other
+
+    def wait(self, samples: Samples) -> None:
+        """Let samples be all that has been pushed and has not become steps."""
+        self._pending = [samples] if len(samples.t) else []
 
     def rest(self) -> Samples:
         """What has been pushed and has not become steps."""
@@ -183,13 +233,22 @@ class Driver:
         if bridged.any():
             unknown = np.repeat(np.square(MANOEUVRE), 3) * 2.0 * MANOEUVRE_TIME
             variance[bridged] = unknown / np.maximum(dt[bridged], 1e-9)[:, None]
-        q, fade = self.flight.noise(dt, variance)
+        q, fade = self.flight.noise(dt, variance, self._walks(t, before))
         z, r = self._measurements(rows)
         shown = (t // self._output != before // self._output).astype(np.uint8)
         inertial = ~np.isnan(rows.z[:, IMU])
         self._t = self._imu_t = int(times[-1])
         self._u = u_end[-1].copy()
         return Steps(t, rows.t_rx, Drive(dt, u, q, fade, z, r, bridged.astype(np.uint8), shown), inertial)
+
+    def _walks(self, t: Times, before: Times) -> Floats:
+        """For how much time wind and biases walk at each step (N,), s: since they last did, five times a second."""
+        slow = np.zeros(len(t))
+        at = np.flatnonzero(t // WALK != before // WALK)
+        slow[at] = np.diff(t[at], prepend=self._walked) * 1e-9
+        if len(at):
+            self._walked = int(t[at[-1]])
+        return slow
 
     def _measurements(self, rows: Samples) -> tuple[Floats, Floats]:
         """Measurements (N, 10) and variances, with what is no measurement left out."""
@@ -198,8 +257,8 @@ class Driver:
         z[:, 0] = self._airspeed(rows)
         blind = max(BLIND * s.airspeed, 0.6 * s.stall_speed)
         z[~(z[:, 0] > blind), 0] = np.nan
-        self._drop_repeats(rows.t, z, 0)
-        self._drop_repeats(rows.t, z, HEIGHT)
+        self._drop_repeats(rows.t, z, 0, rows.z[:, (MEASURED, IMPACT)])
+        self._drop_repeats(rows.t, z, HEIGHT, z[:, HEIGHT : HEIGHT + 1])
         if s.mode == "I":
             z[:, :ATTITUDE] = np.nan
         if s.mode == "P":
@@ -232,16 +291,16 @@ class Driver:
         with np.errstate(invalid="ignore"):
             return atmosphere.true_airspeed(impact, np.where(np.isnan(filled), atmosphere.SEA_LEVEL_PRESSURE, filled))
 
-    def _drop_repeats(self, t: Times, z: Floats, column: int) -> None:
-        """A value that is exactly the one before was held, not measured."""
-        at = np.flatnonzero(~np.isnan(z[:, column]))
+    def _drop_repeats(self, t: Times, z: Floats, column: int, said: Floats) -> None:
+        """What is exactly the same as before was held, not measured; ``said`` (N, k): as the sensor says it."""
+        at = np.flatnonzero(~np.isnan(said).all(axis=1))
         if not len(at):
             return
-        value, when = self._last.get(column, (np.nan, 0))
-        values, times = z[at, column], t[at]
-        again = values == np.concatenate([[value], values[:-1]])
+        values, times = np.where(np.isnan(said[at]), np.inf, said[at]), t[at]
+        value, when = self._said.get(column, (np.full(values.shape[1], np.nan), 0))
+        again = (values == np.concatenate([value[None], values[:-1]])).all(axis=1)
         again &= times - np.concatenate([[when], times[:-1]]) < REPEAT
-        self._last[column] = (float(values[-1]), int(times[-1]))
+        self._said[column] = (values[-1].copy(), int(times[-1]))
         z[at[again], column] = np.nan
 
     def _thin_attitude(self, t: Times, z: Floats) -> None:

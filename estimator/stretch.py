@@ -57,6 +57,18 @@ class Smoothed(NamedTuple):
     w: Floats
 
 
+class Point(NamedTuple):
+    """An epoch to which a stretch can be wound back: the carry there, and how many blocks and steps there were.
+
+    `closed` is whether an anchor stood after the last of them.
+    """
+
+    carry: Carry
+    blocks: int
+    steps: int
+    closed: int
+
+
 class Diverged(ArithmeticError):
     """The filter's result is no longer finite; ``step`` says where."""
 
@@ -124,6 +136,31 @@ class Stretch:
             parts.append(self._filter(block, drive.part(first, stop), first))
             first = stop
         return parts[0] if len(parts) == 1 else Filtered(*(np.concatenate(c) for c in zip(*parts, strict=True)))
+
+    def point(self) -> Point:
+        """The present epoch, to come back to with `rewind`; good until `drop`."""
+        last = self._blocks[-1] if self._blocks else None
+        closed = int(last.rows.closed[last.count - 1]) if last is not None and last.rows is not None else 1
+        return Point(self.carry.copy(), len(self._blocks), 0 if last is None else last.count, closed)
+
+    def rewind(self, point: Point) -> None:
+        """Forget the steps since a point: the filter goes on from there, to the same bits as if they had never been.
+
+        Snapshots that have been let go of in the meantime are made again.
+        """
+        self.carry = point.carry.copy()
+        del self._blocks[point.blocks :]
+        if not self._blocks:
+            return
+        block = self._blocks[-1]
+        if block.count > point.steps:
+            block.drives, block.tolds = [block.drive().part(0, point.steps)], [block.told().part(0, point.steps)]
+            block.count = point.steps
+        if block.rows is None:
+            block.rows = Rows.empty(BLOCK, self.flight.n, self.flight.p)
+            rows = block.rows.part(0, block.count)
+            self._forward(block, block.begin.copy(), About.nothing(), rows, hidden=True)
+        block.rows.closed[block.count - 1] = point.closed
 
     def _begin(self) -> None:
         """Begin a block at the present epoch."""

@@ -2,8 +2,8 @@
 
 Samples come in the order of their arrival, a little out of order in their own time. They wait until the newest time
 seen is `lag` ahead of theirs, and leave in the order of that time; samples of one time make one step. A sample that
-comes after its place has been passed is late: it is counted and does not enter the filter. Where nothing was measured
-for longer than `grid`, steps without a measurement are put in, so that the growth of uncertainty is seen and not
+comes after its place has been passed is late: it is counted and kept aside. Where nothing was measured for longer than
+`grid`, steps without a measurement are put in, so that the growth of uncertainty is seen and not
 drawn over.
 
 Everything is decided by the order of arrival alone, so the steps do not depend on how the stream was cut into batches.
@@ -56,6 +56,8 @@ class Steps(NamedTuple):
         Time and number of released marks.
     late : list of (int, int)
         Time at which a late sample was noticed and its sensor.
+    belated : Rows or None
+        The late samples themselves, in the order of `late`.
     """
 
     t: Times
@@ -68,6 +70,7 @@ class Steps(NamedTuple):
     used: NDArray[np.int64]
     marks: list[tuple[int, int]]
     late: list[tuple[int, int]]
+    belated: Rows | None = None
 
     def cut(self, first: int, last: int) -> Steps:
         """The steps from `first` to before `last`, without marks and late samples."""
@@ -135,7 +138,9 @@ class Synchroniser:
         newest = np.maximum.accumulate(np.concatenate([[self._newest], seen]))
         passed = newest[:-1] - self._lag
         is_late = rows.t <= passed
-        late = [(int(passed[i]) + 1, int(rows.sensor[i])) for i in np.flatnonzero(is_late & ~is_mark)]
+        missed = np.flatnonzero(is_late & ~is_mark)
+        late = [(int(passed[i]) + 1, int(rows.sensor[i])) for i in missed]
+        belated = take(rows, missed) if len(missed) else None
         time = np.where(is_late & is_mark, passed + 1, rows.t)
         self._newest = int(newest[-1])
 
@@ -146,7 +151,7 @@ class Synchroniser:
             last = waiting.t[ready & (waiting.sensor != MARK)].max(initial=np.iinfo(np.int64).min)
             ready &= (waiting.sensor != MARK) | (waiting.t <= last)
         self._waiting = take(waiting, ~ready)
-        return self._steps(take(waiting, ready), late)
+        return self._steps(take(waiting, ready), late)._replace(belated=belated)
 
     def _steps(self, rows: Rows, late: list[tuple[int, int]]) -> Steps:
         is_mark = rows.sensor == MARK

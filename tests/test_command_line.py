@@ -71,6 +71,31 @@ def test_smooth_review_and_plot(log, tmp_path):
     assert [w["reason"] for w in windows if w["model"] == "flight_path"] == ["mark", "end"]
 
 
+def test_a_simulated_flight_becomes_a_log_or_arrays(tmp_path):
+    flight = [
+        "sim",
+        "c172x",
+        "--manoeuvre",
+        "3-2-1-1",
+        "--sensors",
+        "fti",
+        "--turbulence",
+        "3",
+        "--dropout",
+        "gnss:5:8",
+    ]
+    done = run(*flight, "--to", "flight.tlog", "--faults", "loss=0.1", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("flight.tlog: ")
+    smoothed = run("smooth", "flight.tlog", cwd=tmp_path)
+    assert smoothed.returncode == 0, smoothed.stderr
+    done = run(*flight, "--to", "flight.npz", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "truth and sensors" in done.stdout
+    wrong = run("sim", "c172x", "--to", "flight.npz", "--dropout", "gnss", cwd=tmp_path)
+    assert "--dropout gnss: SENSOR:START:STOP is needed" in one_line(wrong)
+
+
 def test_the_output_is_never_overwritten(log, tmp_path):
     (tmp_path / "out.rrd").write_text("mine")
     done = run("smooth", log, "-o", "out.rrd", cwd=tmp_path)

@@ -17,6 +17,7 @@ kinematics last, so that the noise of the inertial sensors changes the last seve
 
     [tail | ba, bg | h, v, a]       tail: kV, b_alpha, b_beta (k_alpha, k_beta), W (mode G), T
 """
+
 from pathlib import Path
 
 from estimator import ud

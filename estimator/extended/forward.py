@@ -43,6 +43,7 @@ from estimator.kinematics import (
     TURBULENCE,
     VELOCITY,
     M,
+    deafen,
     observe_air,
     observe_attitude,
     observe_velocity,
@@ -210,6 +211,8 @@ def forward(
                 omega[j] = drive.u[i, 3 + j] - xm[10 + j]
             if air:
                 observe_air(xm, r33, omega, model.vane, y[AIR:ATTITUDE], h[AIR:ATTITUDE], work)
+                if model.deaf:
+                    deafen(xm, r33, h[AIR:ATTITUDE])
                 if xm[1] < SLOW:
                     air = False
             if attitude:

@@ -33,6 +33,8 @@ class Model(NamedTuple):
     earth : Earth
     wind : int
         Number of the first state that a pass about a trajectory predicts: WIND, or TURBULENCE.
+    deaf : bool
+        Alpha and beta are not asked for the airspeed (`kinematics.deafen`).
     """
 
     order: Order
@@ -42,6 +44,7 @@ class Model(NamedTuple):
     antenna: Array
     earth: Earth
     wind: int
+    deaf: bool = False
 
 
 class Drive(NamedTuple):

@@ -9,6 +9,7 @@ smoother in ``extended``.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Literal, NamedTuple
 
 import msgspec
@@ -77,6 +78,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         By how much a satellite fix is older than its time says, s; None: estimated.
     air_delay : float
         The same of the pressure sensors, s.
+    flow_tells_airspeed : bool
+        Whether alpha and beta may tell the airspeed in turbulence too, where the aircraft's yielding misleads them.
     turbulence, turbulence_time : float
         Standard deviation of a gust component, m/s, and its correlation time, s (length over airspeed).
     wind, wind_walk : float
@@ -110,6 +113,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     gnss_velocity: Positive | None = None
     gnss_delay: float | None = None
     air_delay: float = 0.0
+    flow_tells_airspeed: bool = False
     turbulence: NotNegative = 1.5
     turbulence_time: Positive = 5.0
     wind: Positive = 10.0
@@ -147,7 +151,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return cls(**{**grade, **changes})  # type: ignore[arg-type]
 
 
-GRADES = {"autopilot": Settings, "mems": Settings.mems, "fti": Settings.fti}
+GRADES: dict[str, Callable[[], Settings]] = {"autopilot": Settings, "mems": Settings.mems, "fti": Settings.fti}
 """Settings to begin from, by name."""
 
 
@@ -200,6 +204,7 @@ class FlightPath(NamedTuple):
         model = extended.Model(
             order, fades, np.array(driven, np.int64), np.array(settings.vane, np.float64),
             np.array(settings.antenna, np.float64), earth, WIND if predict_wind else TURBULENCE,
+            not (calm or settings.flow_tells_airspeed),
         )  # fmt: skip
         return cls(
             settings, tuple(ALL_NAMES[i] for i in told), tuple(ALL_UNITS[i] for i in told), model, 6 + len(driven)

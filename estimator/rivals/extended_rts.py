@@ -34,6 +34,7 @@ from estimator.kinematics import (
     STEEP,
     VELOCITY,
     M,
+    deafen,
     observe_air,
     observe_attitude,
     observe_velocity,
@@ -186,6 +187,8 @@ def forward(model: Model, drive: Drive, start: Array, room: Room) -> int:
                 omega[j] = drive.u[i, 3 + j] - x[10 + j]
             if seen & 1 and not x[1] < SLOW:
                 observe_air(x, r33, omega, model.vane, y[AIR:ATTITUDE], h[AIR:ATTITUDE], work)
+                if model.deaf:
+                    deafen(x, r33, h[AIR:ATTITUDE])
                 used |= 1
             if seen & 2:
                 observe_attitude(q1, y[ATTITUDE:HEIGHT], h[ATTITUDE:HEIGHT], work)

@@ -11,7 +11,7 @@ needs inertial sensors at 20 Hz or more.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import msgspec
@@ -19,13 +19,18 @@ import numpy as np
 
 from estimator.stage.epoch import TAKEN, Epoch
 from estimator.stage.settings import STAGE, Scope, Settings
+from estimator.stretch import Stretch
 from telemetry.messages import AirData, Altitude, Attitude, FlowAngles, Gnss, Imu, Message, Progress
 
 __all__ = ["STAGE", "Scope", "Settings", "estimate", "warm_up"]
 
 
 def estimate(
-    messages: Iterable[Message], settings: Settings | None = None, *, scope: Scope = "window"
+    messages: Iterable[Message],
+    settings: Settings | None = None,
+    *,
+    scope: Scope = "window",
+    begun: Callable[[Stretch], object] | None = None,
 ) -> Iterator[Message]:
     """Estimate the state of every vehicle.
 
@@ -37,6 +42,8 @@ def estimate(
     scope : {"window", "sortie"}
         What a window's smoothing knows: everything up to its closing, told when it closes; or the whole leg, in
         general the boot epoch, told when that ends.
+    begun : callable, optional
+        Given every stretch of flight path when it begins, before its first step; it is to be looked at only.
 
     Yields
     ------
@@ -50,6 +57,7 @@ def estimate(
             epochs = vehicles.setdefault(message.vehicle, {})
             if message.boot not in epochs:
                 epochs[message.boot] = Epoch(message.vehicle, message.boot, settings, scope)
+                epochs[message.boot].begun = begun
             epochs[message.boot].take(message)
         elif isinstance(message, Progress):
             until = int(message.t_rx[-1])

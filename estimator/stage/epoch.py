@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -12,7 +12,9 @@ from estimator.models.trajectory import Trajectory
 from estimator.stage.flight import Flight
 from estimator.stage.rows import GNSS, KINDS, SENSORS, WITNESSES, rows
 from estimator.stage.settings import STAGE, Level, Reason, Scope, Settings
+from estimator.stage.sieve import Sieve
 from estimator.stage.trajectory import Leg
+from estimator.stretch import Stretch
 from estimator.synchronise import MARK, Rows, concatenate, take
 from telemetry.messages import Event, Mark, Message, event
 
@@ -27,6 +29,7 @@ class Epoch:
         self.vehicle, self.boot, self.settings, self.scope = vehicle, boot, settings, scope
         self._lag = round(settings.lag * 1e9)
         self._arrivals = Arrivals(SENSORS, GNSS, lag=self._lag, witnesses=WITNESSES)
+        self._sieve = Sieve()
         self.marks: list[tuple[str, str]] = []  # action and name
         self._leg: Leg | None = None
         self._flight: Flight | None = None
@@ -34,6 +37,7 @@ class Epoch:
         self.found: dict[str, list[tuple[float, float]]] = {}  # parameters of the test points so far: value, sigma
         self._number, self._test_point = 0, ""  # of the next leg's first window
         self._begun = False
+        self.begun: Callable[[Stretch], object] | None = None  # told of every flight path that begins
         self._samples, self._t, self._t_rx = 0, np.iinfo(np.int64).min, np.iinfo(np.int64).min
 
     def take(self, message: Message) -> None:
@@ -53,6 +57,10 @@ class Epoch:
     def advance(self, until: int, end: Reason | None = None) -> Iterator[Message]:
         """Filter what is complete, and tell the windows that close on the way."""
         arrived = self._arrivals.covered(until)
+        if arrived is not None:
+            arrived, refusals = self._sieve.sift(arrived)
+            for refusal in refusals:
+                yield self.event("warning", *refusal)
         while arrived is not None and len(arrived.t):
             piece = self._arrivals.judge(arrived, end is not None)
             arrived = piece.rest
@@ -97,6 +105,8 @@ class Epoch:
                 yield from self._fail(leg, error)
             else:
                 yield from self._over(leg, reason, until)
+        for text in self._sieve.sums():
+            yield self.event("warning", text, self._t, self._t_rx)
         if not self._begun:
             text = f"no satellite fix in boot {self.boot}: nothing to estimate from {self._samples} samples"
             yield self.event("warning", text, self._t, self._t_rx)
@@ -109,12 +119,24 @@ class Epoch:
 
     def _fly(self, samples: Rows, until: int) -> Iterator[Message]:
         if self._flight is not None:
-            yield from self._flight.advance(samples, until)
+            try:
+                yield from self._flight.advance(samples, until)
+            except (ValueError, ArithmeticError) as error:
+                yield self._lost(self._flight, error)
+                self._flight = None
 
     def _land(self, reason: Reason, until: int) -> Iterator[Message]:
         if self._flight is not None:
             flight, self._flight = self._flight, None
-            yield from flight.finish(reason, until)
+            try:
+                yield from flight.finish(reason, until)
+            except (ValueError, ArithmeticError) as error:
+                yield self._lost(flight, error)
+
+    def _lost(self, flight: Flight, error: Exception) -> Event:
+        """Give the flight path of this leg up; the trajectory goes on."""
+        text = f"the flight path of vehicle {self.vehicle}, boot {self.boot} failed, the trajectory goes on: {error}"
+        return self.event("error", text, *(flight.at or (self._t, self._t_rx)))
 
     def _over(self, leg: Leg, reason: Reason, until: int) -> Iterator[Message]:
         yield from self._land(reason, until)

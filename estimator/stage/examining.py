@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator import atmosphere, suspicion
+from estimator.alignment import SLOWEST, rate
 from estimator.drive import IMPACT, IMU, MEASURED, STATIC
 from estimator.kinematics import ATTITUDE as ANGLES
 from estimator.kinematics import Earth
@@ -24,7 +25,19 @@ KEPT = {
     AIR: (MEASURED, IMPACT),
     FLOW: (MEASURED + 1, MEASURED + 2),
 }
+EVER = 1 << 62  # ns
+HOLE = 1.75  # usual intervals between two samples: from there on one is missing, and not only late
 CERTAIN = 5.0  # sigmas at which a delay that was found is taken off
+
+
+def absent(t: Times, period: int, first: int, stop: int) -> Times:
+    """Times between two times at which samples were due that did not come: in the holes between ``t``, rising."""
+    edges = np.concatenate([[first], t, [stop]])
+    spans = np.diff(edges) / period
+    count = np.where(spans > HOLE, np.rint(spans) - 1.0, 0.0).astype(np.int64)
+    index = np.repeat(np.arange(len(count)), count)
+    position = np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count) + 1
+    return np.asarray(edges[index] + position * period)
 
 
 class Examiner:
@@ -37,23 +50,30 @@ class Examiner:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._kept: dict[int, list[tuple[Times, Floats]]] = {sensor: [] for sensor in KEPT}
+        self._kept: dict[int, list[tuple[Times, Times, Floats]]] = {sensor: [] for sensor in KEPT}
 
-    def take(self, samples: Rows) -> None:
-        """Keep samples, in order of their arrival."""
+    def take(self, samples: Rows, passed: Times) -> None:
+        """Keep samples, in order of their arrival.
+
+        ``passed`` (k,): time that had been passed, and would not be waited for, when each of them arrived.
+        """
         for sensor, columns in KEPT.items():
             mine = np.flatnonzero(samples.sensor == sensor)
             if len(mine):
-                self._kept[sensor].append((samples.t[mine], samples.z[np.ix_(mine, columns)]))
+                self._kept[sensor].append((samples.t[mine], passed[mine], samples.z[np.ix_(mine, columns)]))
 
-    def findings(self, first: int, stop: int, taken: float) -> tuple[str, ...]:
+    def findings(self, first: int, stop: int, heard: int, taken: float) -> tuple[str, ...]:
         """What is wrong with the sensors from time `first` to `stop`, ns, in words.
 
-        ``taken`` is the delay of the fixes that was taken off, s, configured or found.
+        ``heard``: what came after this time had been passed does not count, so that it does not matter when the
+        question is asked. ``taken`` is the delay of the fixes that was taken off, s, configured or found.
         """
-        columns, gravity = self._columns(first, stop)
+        columns, gravity = self._columns(first, stop, heard)
         configured = self._settings.gnss_delay or 0.0
-        found = suspicion.examine(columns, gravity=gravity, gnss_delay=configured, gnss_arm=self._settings.antenna)
+        try:
+            found = self._examine(columns, gravity, configured)
+        except (ValueError, ArithmeticError, IndexError) as error:
+            return (f"the sensors could not be examined: {error}",)
         return tuple(
             f"{finding.text} ({taken:.3f} s were taken off here)"
             if finding.defect == "delay" and taken != configured
@@ -63,36 +83,64 @@ class Examiner:
 
     def delay(self) -> float:
         """By how much the satellite fixes are older than they say, s; 0 where that is not certain."""
-        columns, gravity = self._columns(-(1 << 62), 1 << 62)
-        for finding in suspicion.examine(columns, gravity=gravity, gnss_arm=self._settings.antenna):
+        columns, gravity = self._columns(-EVER, EVER, EVER)
+        try:
+            found = self._examine(columns, gravity, 0.0)
+        except (ValueError, ArithmeticError, IndexError):
+            return 0.0
+        for finding in found:
             if finding.defect == "delay" and finding.value > CERTAIN * finding.sigma:
                 return round(finding.value, 3)
         return 0.0
 
-    def loss(self, first: int, stop: int) -> float | None:
-        """Share of inertial samples due between two times that did not come; None without any."""
-        t = self._sensor(INERTIAL, first, stop)[0]
-        if len(t) < 10:
-            return None
-        spans = np.diff(np.sort(t))
-        period = float(np.median(spans))
-        missing = np.maximum(np.round(spans.astype(np.float64) / period) - 1.0, 0.0).sum() if period > 0.0 else 0.0
-        return float(missing / (missing + len(t)))
+    def _examine(self, columns: suspicion.Columns, gravity: float, delay: float) -> list[suspicion.Finding]:
+        with np.errstate(all="ignore"):  # the columns are as bad as they are
+            return suspicion.examine(columns, gravity=gravity, gnss_delay=delay, gnss_arm=self._settings.antenna)
 
-    def _sensor(self, sensor: int, first: int, stop: int) -> tuple[Times, Floats]:
+    def fast(self) -> bool:
+        """Whether inertial samples have come often enough for a flight path."""
+        t = self._sensor(INERTIAL, -EVER, EVER, EVER)[0]
+        return rate(t) >= SLOWEST
+
+    def due(self, first: int, stop: int, heard: int) -> dict[int, tuple[Times, int]]:
+        """Times of each sensor's samples between two times, and its usual interval up to then, ns; of those that have
+        spoken ten times or more.
+        """
+        found = {}
+        for sensor in KEPT:
+            t = self._sensor(sensor, -EVER, stop, heard)[0]
+            if len(t) >= 10:
+                found[sensor] = t[np.searchsorted(t, first) :], max(int(np.median(np.diff(t))), 1)
+        return found
+
+    def loss(self, first: int, stop: int, heard: int) -> float | None:
+        """Share of the samples due between two times that did not come, over all sensors; None without any."""
+        missing = came = 0
+        for t, period in self.due(first, stop, heard).values():
+            missing += len(absent(t, period, first, stop))
+            came += len(t)
+        return missing / (missing + came) if came else None
+
+    def _sensor(self, sensor: int, first: int, stop: int, heard: int) -> tuple[Times, Floats]:
         parts = self._kept[sensor]
         if not parts:
             return np.empty(0, np.int64), np.empty((0, len(KEPT[sensor])))
         if len(parts) > 1:
-            parts[:] = [(np.concatenate([t for t, _ in parts]), np.concatenate([z for _, z in parts]))]
-        t, z = parts[0]
-        inside = (t >= first) & (t <= stop)
-        return (t, z) if inside.all() else (t[inside], z[inside])
+            t, passed, z = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+            parts[:] = [(t, passed, z)]
+        t, passed, z = parts[0]
+        inside = (t >= first) & (t <= stop) & (passed < heard)
+        if not inside.all():
+            t, z = t[inside], z[inside]
+        if (np.diff(t) <= 0).any():  # in order of time, of two at one time the first to arrive, as they are used
+            t, order = np.unique(t, return_index=True)
+            z = z[order]
+        return t, z
 
-    def _columns(self, first: int, stop: int) -> tuple[suspicion.Columns, float]:
-        imu, angles = self._sensor(INERTIAL, first, stop), self._sensor(ATTITUDE, first, stop)
-        air, flow = self._sensor(AIR, first, stop), self._sensor(FLOW, first, stop)
-        height, fixes = self._sensor(ALTITUDE, first, stop), self._sensor(GNSS, first, stop)
+    def _columns(self, first: int, stop: int, heard: int) -> tuple[suspicion.Columns, float]:
+        imu, angles, air, flow, height, fixes = (
+            self._sensor(sensor, first, stop, heard) for sensor in (INERTIAL, ATTITUDE, AIR, FLOW, ALTITUDE, GNSS)
+        )
         gravity = 9.80665
         if len(fixes[0]):
             earth = Earth.at(float(fixes[1][0, 0]), 0.0)
@@ -105,6 +153,10 @@ class Examiner:
             if known.any():
                 static = np.interp(air[0], height[0][known], height[1][known, 1])
             speed = atmosphere.true_airspeed(impact, static)
+            same = np.zeros(len(speed), np.bool_)  # said again: no new value because the static pressure has changed
+            same[1:] = ((air[1][1:] == air[1][:-1]) | np.isnan(air[1][1:])).all(axis=1)
+            said = np.maximum.accumulate(np.where(same, 0, np.arange(len(speed))))
+            speed = speed[said]
         return (
             suspicion.Columns(
                 imu=suspicion.Imu(imu[0], imu[1][:, :3], imu[1][:, 3:]),

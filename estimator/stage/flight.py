@@ -2,41 +2,50 @@
 
 A stretch begins when the sensors allow an alignment and ends with a silence of the inertial sensors, when roll is no
 longer known, or when the filter fails; the next one begins as soon as it can. Windows close at marks, after their
-length, and with the stretch. Over a whole sortie a stretch is smoothed when it ends, once as the filter linearised it
-and then about the smoothed trajectory.
+length, and with the stretch. Samples that came too late for the filter but into the open window are put in when it
+closes: the window is filtered again, and the filter goes on from there. Over a whole sortie a stretch is smoothed when
+it ends, once as the filter linearised it and then about the smoothed trajectory.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator import alignment
 from estimator.arrivals import Place
-from estimator.drive import LONGEST_GAP, MEASURED, WIDTH, Driver, Samples, Steps
+from estimator.drive import IMPACT, LONGEST_GAP, MEASURED, WIDTH, Driver, Samples, Steps
 from estimator.models.flight_path import FlightPath
 from estimator.stage.examining import Examiner
 from estimator.stage.passage import Closed, Passage
 from estimator.stage.report import Sum, test_point_report
 from estimator.stage.rows import AIR, GNSS, SENSORS
 from estimator.stage.settings import Reason
-from estimator.stretch import Diverged, Smoothed, Stretch
-from estimator.synchronise import MARK, Rows, Synchroniser, take
+from estimator.stretch import Diverged, Filtered, Smoothed, Stretch
+from estimator.synchronise import MARK, Rows, Synchroniser, concatenate, take
 from telemetry.messages import Message
 
 if TYPE_CHECKING:
     from estimator.stage.epoch import Epoch
+
+Times = NDArray[np.int64]
 
 S = 1_000_000_000
 TRY = S // 2  # ns between two attempts to begin
 PATIENCE = 5 * S  # ns of vain attempts before the reason is told
 UNKNOWN_ROLL = math.radians(60.0)
 DOUBTS = 6  # times that one stretch may be doubted
+PAUSE, LONGEST_PAUSE = 2 * S, 120 * S  # ns from a stretch that failed to the next, twice as long after each failure
+SOUND = 120 * S  # ns: a stretch that lasted so long was no failure of the sensors
+ALL = 1 << 62
+AIR_NOW = "air data have come, which it was begun without"
 
 
 class Flight:
@@ -56,7 +65,7 @@ class Flight:
         self.settings = epoch.settings.flight_path
         self.test_point = test_point
         self._marks: list[tuple[str, str]] = []
-        self._buffer: list[Rows] = []
+        self._buffer: deque[tuple[Rows, int]] = deque()
         self._whole = epoch.scope == "sortie"
         self.examiner = Examiner(self.settings)
         self._delay: float | None = self.settings.gnss_delay
@@ -66,19 +75,30 @@ class Flight:
         self._since: int | None = None
         self._told: set[str] = set()
         self._passage: Passage | None = None
+        self._belated: list[tuple[Times, Rows]] = []  # late samples, and when they were noticed
+        self._newest = -ALL
+        self._last = (0, 0)  # times of the newest arrival
+        self.heard = -ALL  # time that was reached when the newest window closed
+        self._not_before, self._pause = -ALL, PAUSE
         self.sum = Sum()
+
+    @property
+    def at(self) -> tuple[int, int] | None:
+        """Times of the newest step, ns; None where nothing is being flown."""
+        return None if self._passage is None else self._passage.last
 
     def _synchronise(self, delay: float) -> Synchroniser:
         self.delay = delay
-        wait = self.epoch.settings.lag + max(delay, self.settings.air_delay, 0.0)
-        return Synchroniser(len(SENSORS), WIDTH, lag=round(wait * 1e9), grid=1 << 60)
+        self._lag = round((self.epoch.settings.lag + max(delay, self.settings.air_delay, 0.0)) * 1e9)
+        return Synchroniser(len(SENSORS), WIDTH, lag=self._lag, grid=1 << 60)
 
     # -- samples in ----------------------------------------------------------------------------------------------------
 
     def advance(self, samples: Rows, until: int) -> Iterator[Message]:
         """Take what was believed; the flight goes on as far as it is complete."""
         if self._whole and self._delay is None:  # the delay of the fixes first
-            self._buffer.append(samples)
+            self.examiner.take(samples, np.full(len(samples.t), -ALL))
+            self._buffer.append((samples, until))
             return
         self._push(samples)
         yield from self._release(until, False)
@@ -86,25 +106,24 @@ class Flight:
     def finish(self, reason: Reason, until: int) -> Iterator[Message]:
         """Let everything out and close the last window."""
         if self._buffer:
-            yield from self._replay(until)
+            yield from self._replay()
         yield from self._release(until, True)
-        yield from self._land(reason)
+        yield from self._land(reason, ALL)
         if self.sum.flight is not None:
             yield self.sum.report(self)
+        elif self.examiner.fast():  # there could have been a path: perhaps a sensor is why there is none
+            for finding in self.examiner.findings(-ALL, ALL, ALL, self.delay):
+                yield self.epoch.event("warning", finding, *self._last)
 
-    def _replay(self, until: int) -> Iterator[Message]:
+    def _replay(self) -> Iterator[Message]:
         """Find the delay of the satellite fixes in everything there is, then fly."""
-        for samples in self._buffer:
-            self.examiner.take(samples)
         self._synchroniser = self._synchronise(self.examiner.delay())
-        for samples in self._buffer:
+        while self._buffer:
+            samples, covered = self._buffer.popleft()
             self._push(samples, seen=True)
-        self._buffer = []
-        yield from self._release(until, False)
+            yield from self._release(covered, False)
 
     def _push(self, samples: Rows, *, seen: bool = False) -> None:
-        if not seen:
-            self.examiner.take(samples)
         marks = take(samples, samples.sensor == MARK)
         for t, t_rx, number in zip(marks.t, marks.t_rx, marks.z[:, 0], strict=True):
             self._synchroniser.mark(int(t), int(t_rx))
@@ -117,14 +136,20 @@ class Flight:
             z[fixes, :3] = np.nan  # the place: not a specific force
         shift = np.where(fixes, round(self.delay * 1e9), 0)
         shift[rest.sensor == AIR] = round(self.settings.air_delay * 1e9)
-        self._synchroniser.push(rest._replace(t=t - shift, z=z))
+        t = t - shift
+        newest = np.maximum.accumulate(np.concatenate([[self._newest], t]))
+        self._newest = int(newest[-1])
+        if not seen:
+            self.examiner.take(rest, newest[:-1] - self._lag)
+        if len(rest.t):
+            self._last = int(rest.t[-1]), int(rest.t_rx[-1])
+        self._synchroniser.push(rest._replace(t=t, z=z))
 
     def _release(self, until: int, final: bool) -> Iterator[Message]:
         steps = self._synchroniser.release(until, final)
         samples = Samples(steps.t, steps.t_rx, steps.z, steps.r)
-        late = [t for t, sensor in steps.late]
-        if self._passage is not None:
-            self._passage.late += len(late)
+        if steps.belated is not None:
+            self._belated.append((np.array([t for t, _ in steps.late], np.int64), steps.belated))
         marks = list(steps.marks)
         first = 0
         while first < len(samples.t) or marks:
@@ -140,8 +165,10 @@ class Flight:
         if (action == "stop") != (self.test_point == name):
             return  # stopped without having been started, or said twice: the trajectory tells it
         if self._passage is not None:
-            yield from self._close("mark")
+            yield from self._close("mark", when)
         self.test_point = name if action == "start" else ""
+        if self._passage is not None and self._poorer(self._passage):
+            yield from self._end(self._passage, AIR_NOW)
         if self._passage is not None:
             self._passage.open(self.test_point, when)
 
@@ -158,8 +185,7 @@ class Flight:
         """Try to begin, twice a second; gives back the samples after the beginning."""
         slot = samples.t // TRY
         first = slot != np.concatenate([[self._tried], slot[:-1]])
-        self._tried = int(slot[-1])
-        for i in np.flatnonzero(first).tolist():
+        for i in np.flatnonzero(first & (samples.t >= self._not_before)).tolist():
             recent = self._lately(samples.rows(slice(i + 1)), 1)
             found = self._begin(recent)
             if isinstance(found, str):
@@ -168,9 +194,9 @@ class Flight:
             now = recent.rows(slice(found.row + 1, None))  # after the inertial sample of the beginning
             flight, begin = self._model(recent), recent.rows(slice(found.row + 1))
             yield from self._take_off(flight, begin, found)
-            self._recent = []
+            self._recent, self._tried = [], int(slot[i])
             return Samples.join([now, samples.rows(slice(i + 1, None))])
-        self._recent = [self._lately(samples, 2)]
+        self._recent, self._tried = [self._lately(samples, 2)], int(slot[-1])
         return Samples.none()
 
     def _lately(self, samples: Samples, spans: int) -> Samples:
@@ -182,7 +208,7 @@ class Flight:
     def _model(self, recent: Samples) -> FlightPath:
         settings = self.settings
         if settings.mode == "auto":
-            air = bool(np.isfinite(recent.z[:, MEASURED]).any())
+            air = bool(np.isfinite(recent.z[:, (MEASURED, IMPACT)]).any())
             settings = msgspec.structs.replace(settings, mode="G" if air else "I")
         return FlightPath.of(settings, self.origin[0], self.origin[2])
 
@@ -209,6 +235,8 @@ class Flight:
     def _take_off(self, flight: FlightPath, begin: Samples, found: alignment.Start) -> Iterator[Message]:
         t = int(begin.t[-1])
         stretch = Stretch(flight, flight.start(found.values, found.sigma))
+        if self.epoch.begun is not None:
+            self.epoch.begun(stretch)
         driver = Driver(
             flight, t, begin.z[-1, :6].copy(), found.period, output=round(self.epoch.settings.output * 1e9),
             attitude_interval=round(flight.settings.attitude_interval * 1e9),
@@ -217,7 +245,7 @@ class Flight:
         self._passage.open(self.test_point, t)
         self._told.clear()
         yield self.epoch.event(
-            "info",
+            "warning" if found.doubtful else "info",
             f"flight path, mode {flight.settings.mode}, {flight.n} states: inertial samples at "
             f"{1 / found.period:.1f} Hz, {found.text}, satellite fixes taken as {self.delay:.2f} s old",
             t,
@@ -234,73 +262,131 @@ class Flight:
         longest = round((settings.test_point if self.test_point else settings.window) * 1e9)
         stop = int(np.searchsorted(samples.t, passage.begin + longest, "right"))
         over = stop < len(samples.t)
-        steps = passage.driver.push(samples.rows(slice(stop)))
+        before = passage.driver.rest()
+        steps = passage.push(samples.rows(slice(stop)))
         rest = samples.rows(slice(stop, None))
         if steps is not None:
             bad = yield from self._filter(passage, steps)
             if bad is not None:
-                yield from self._end(passage, bad)
-                return rest
+                every = Samples.join([before, samples])
+                remains = every.rows(slice(int(np.searchsorted(every.t, passage.last[0], "right")), None))
+                yield from self._fail(passage, bad)
+                return remains
         if passage.driver.gap is not None:
             remains = Samples.join([passage.driver.rest(), rest])
             yield from self._end(passage, f"more than {LONGEST_GAP:.0f} s without inertial samples")
             return remains
-        if over:
-            yield from self._close("length")
-            passage.open(self.test_point, passage.begin + longest)
+        if not over:
+            return rest
+        yield from self._close("length", int(rest.t[0]))
+        if self._poorer(passage):
+            remains = Samples.join([passage.driver.rest(), rest])
+            yield from self._end(passage, AIR_NOW)
+            return remains
+        passage.open(self.test_point, passage.begin + longest)
         return rest
+
+    def _poorer(self, passage: Passage) -> bool:
+        """Whether the stretch was begun without air data, and now there are some."""
+        return self.settings.mode == "auto" and passage.flight.settings.mode == "I" and passage.air()
 
     def _filter(self, passage: Passage, steps: Steps) -> Generator[Message, None, str | None]:
         """Filter steps and tell the estimates; gives back why the stretch ends, if it does."""
+        point, why = passage.stretch.point(), None
         try:
             filtered = passage.stretch.advance(steps.drive)
+            stop, why = self._trouble(passage, steps, filtered)
         except Diverged as error:
-            return str(error)
+            stop, why = error.step, str(error)
+        if why is not None:  # as if the steps after that had not come
+            passage.stretch.rewind(point)
+            if stop == 0:
+                return why
+            steps = steps.part(stop)
+            filtered = passage.stretch.advance(steps.drive)
         message = passage.account(steps, filtered)
         if message is not None:
             yield message
         yield from passage.events(steps, filtered)
-        shown = steps.drive.shown == 1
-        if passage.doubts >= DOUBTS:
-            return f"measurements contradicted the filter {DOUBTS} times"
-        roll = passage.flight.names.index("phi")
-        level = np.abs(filtered.mean[shown, 4]) < math.radians(80.0)
-        if (filtered.std[shown, roll][level] > UNKNOWN_ROLL).any():
-            return "roll is no longer known to 60 deg"
-        return None
+        return why
 
-    def _end(self, passage: Passage, why: str) -> Iterator[Message]:
+    def _trouble(self, passage: Passage, steps: Steps, filtered: Filtered) -> tuple[int, str | None]:
+        """After how many of the steps the filter is lost, and why."""
+        found: list[tuple[int, str]] = []
+        doubts = passage.doubts + np.cumsum(filtered.doubted != 0)
+        if len(doubts) and doubts[-1] >= DOUBTS:
+            words = f"measurements contradicted the filter {DOUBTS} times: look at the sensors, and at their noise"
+            found.append((int(np.searchsorted(doubts, DOUBTS)) + 1, words))
+        roll, pitch = (passage.flight.names.index(name) for name in ("phi", "theta"))
+        lost = (steps.drive.shown == 1) & (np.abs(filtered.mean[:, pitch]) < math.radians(80.0))
+        lost[lost] = filtered.std[lost, roll] > UNKNOWN_ROLL
+        if lost.any():
+            found.append((int(np.argmax(lost)) + 1, "roll is no longer known to 60 deg"))
+        return min(found) if found else (len(steps.t), None)
+
+    def _fail(self, passage: Passage, why: str) -> Iterator[Message]:
+        """End a stretch whose filter was lost; the next one waits the longer the sooner that happens."""
+        sound = passage.last[0] - passage.first >= SOUND
+        self._pause = PAUSE if sound else self._pause
+        self._not_before = passage.last[0] + self._pause
+        yield from self._end(passage, f"{why}; no other before {self._pause / S:.0f} s have passed", failed=True)
+        self._pause = min(2 * self._pause, LONGEST_PAUSE)
+
+    def _end(self, passage: Passage, why: str, *, failed: bool = False) -> Iterator[Message]:
         """End the stretch; the next one begins when it can."""
         at, at_rx = passage.last
         yield self.epoch.event("warning", f"the flight path ends and begins anew: {why}", at, at_rx)
-        yield from self._land("gap")
+        yield from self._land("gap", at, failed=failed)
 
-    def _close(self, reason: Reason) -> Iterator[Message]:
-        """Close the window of the stretch."""
+    def _close(self, reason: Reason, when: int, *, failed: bool = False) -> Iterator[Message]:
+        """Close the window of the stretch; ``when``: the time that was reached by then."""
         passage = self._passage
         assert passage is not None
+        late = self._late(passage, when)
+        if late is not None and not failed:
+            yield from passage.roll_back(late)
         closed = passage.close(reason)
         if closed is None:
             return
         yield from passage.refused(closed)
+        self.heard = when
         if self._whole:
             return
         smoothed = passage.stretch.smooth()
         yield from self._tell(passage, [closed], smoothed)
         passage.forget()
 
-    def _land(self, reason: Reason) -> Iterator[Message]:
+    def _late(self, passage: Passage, when: int) -> Rows | None:
+        """Late samples that were noticed up to `when` and belong into the open window; older ones are counted."""
+        if not self._belated:
+            return None
+        noticed = np.concatenate([times for times, _ in self._belated])
+        rows = concatenate([part for _, part in self._belated])
+        begin = passage.opened
+        now = noticed <= when
+        older = now & (rows.t <= begin)
+        passage.too_late(rows.sensor[older & (noticed > begin)])
+        inside = now & (rows.t > begin) & (rows.t <= passage.last[0])
+        rest = ~(older | inside)
+        self._belated = [(noticed[rest], take(rows, rest))] if rest.any() else []
+        return take(rows, inside) if inside.any() else None
+
+    def _land(self, reason: Reason, when: int, *, failed: bool = False) -> Iterator[Message]:
         """Close the last window and, over a whole sortie, smooth the stretch."""
         passage = self._passage
         if passage is None:
             return
         self._since = None
-        yield from self._close(reason)
+        yield from self._close(reason, when, failed=failed)
         if self._whole and passage.closed:
-            smoothed = passage.stretch.smooth(std=self.epoch.settings.iterate == 0)
-            for i in range(self.epoch.settings.iterate):
-                last = i == self.epoch.settings.iterate - 1
-                smoothed = passage.stretch.hybrid(smoothed, std=last)
+            smoothed = passage.stretch.smooth()
+            try:
+                for i in range(self.epoch.settings.iterate):
+                    last = i == self.epoch.settings.iterate - 1
+                    smoothed = passage.stretch.hybrid(smoothed, std=last)
+            except ArithmeticError as error:
+                text = f"iterating the smoothed flight path failed, what it was before is told: {error}"
+                yield self.epoch.event("warning", text, *passage.last)
             yield from self._tell(passage, passage.closed, smoothed)
         self._passage = None
 

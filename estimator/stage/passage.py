@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.consistency import Tally
-from estimator.drive import Driver, Steps
+from estimator.drive import IMPACT, MEASURED, Driver, Samples, Steps, merged
 from estimator.extended import REJECTED
 from estimator.kinematics import MEASUREMENTS, M
 from estimator.models.flight_path import MODEL, FlightPath
 from estimator.stage.rows import SENSORS
 from estimator.stage.settings import STAGE, Reason
-from estimator.stretch import Filtered, Smoothed, Stretch
+from estimator.stretch import Diverged, Filtered, Point, Smoothed, Stretch
+from estimator.synchronise import Rows
 from estimator.ud import compiled
 from telemetry.messages import Estimate, Event, Window
 
@@ -30,6 +32,7 @@ Times = NDArray[np.int64]
 
 SENSOR_OF = ("air_data", "flow_angles", "flow_angles", *("attitude",) * 3, "altitude", *("gnss",) * 3)
 FIRST_OF = (0, 1, 3, 6, 7)  # one channel of each sensor, by which its samples are counted
+TOLD_GAP = 0.5  # s without inertial samples that are told at once
 DOUBTED = {1: "velocity", 2: "attitude", 4: "turbulence"}
 
 
@@ -46,6 +49,28 @@ def _sums(square: Floats, used: Times, shown: NDArray[np.uint8], left: Floats, n
             left[0] = 0.0
             left[1] = 0.0
             k += 1
+
+
+class _Opening(NamedTuple):
+    """Everything as it was when the window was opened."""
+
+    t: int
+    point: Point
+    driver: Driver
+    left: Floats
+    steps: int
+
+
+def _bridged(steps: Steps) -> Iterator[tuple[int, float]]:
+    """Ends of the intervals without inertial data, and how long they were, s."""
+    bridged = steps.drive.bridged == 1
+    if not bridged.any():
+        return
+    ends = np.flatnonzero(steps.inertial)
+    for i in np.flatnonzero(bridged & steps.inertial).tolist():
+        before = int(np.searchsorted(ends, i)) - 1
+        begin = int(ends[before]) + 1 if before >= 0 else 0
+        yield i, float(steps.drive.dt[begin : i + 1].sum())
 
 
 @dataclass(slots=True)
@@ -71,9 +96,9 @@ class Closed:
     nis: float = 0.0
     dof: int = 0
     bridged: float = 0.0
-    anchors: int = 0
-    late: int = 0
-    span: tuple[int, int] = (0, 0)
+    gaps: int = 0  # that were interpolated and not told one by one
+    longest: float = 0.0  # of these, s
+    late: dict[str, int] = field(default_factory=dict)
 
 
 class Passage:
@@ -94,21 +119,79 @@ class Passage:
     ) -> None:  # fmt: skip
         self._leg, self.flight, self.stretch, self.driver = flight, model, stretch, driver
         self.last = (t, t_rx)
-        self.begin = t
+        self.first = self.begin = self.opened = t
         self.doubts = 0
-        self.late = 0
+        self._late: dict[str, int] = {}
         self.closed: list[Closed] = []
         self._left = np.zeros(2)
         self._steps = 0  # since the stretch was last forgotten
         self._configuration = msgspec.json.encode(flight.epoch.settings)
         self._window: Closed | None = None
+        self._opening: _Opening | None = None
+        self._log: list[Samples] = []  # since then
 
     def open(self, test_point: str, begin: int) -> None:
         """Begin a window."""
-        self.begin = begin
-        self._window = Closed(
-            self._leg.epoch.flown, test_point, self.last[0], self._steps, hashlib.sha256(self._configuration)
-        )
+        self.begin, self.opened = begin, self.last[0]
+        self._window = self._new(test_point, self.last[0])
+        left, steps = self._left.copy(), self._steps
+        self._opening = _Opening(self.last[0], self.stretch.point(), self.driver.copy(), left, steps)
+        self._log = []
+
+    def _new(self, test_point: str, begin: int) -> Closed:
+        digest = hashlib.sha256(self._configuration)
+        return Closed(self._leg.epoch.flown, test_point, begin, self._steps, digest)
+
+    def push(self, samples: Samples) -> Steps | None:
+        """Steps that are complete, as `Driver.push`."""
+        if len(samples.t):
+            self._log.append(samples)
+        return self.driver.push(samples)
+
+    def air(self) -> bool:
+        """Whether an airspeed has come since the window was opened."""
+        return any(bool(np.isfinite(part.z[:, (MEASURED, IMPACT)]).any()) for part in self._log)
+
+    def too_late(self, sensors: Times) -> None:
+        """Count samples that came after their window had been closed."""
+        for sensor in sensors.tolist():
+            self._late[SENSORS[sensor]] = self._late.get(SENSORS[sensor], 0) + 1
+
+    def roll_back(self, late: Rows) -> Iterator[Event]:
+        """Filter the open window again with samples that came too late for it; the filter goes on from there."""
+        window, opening = self._window, self._opening
+        if window is None or opening is None or not window.t:
+            return
+        samples = Samples.join([opening.driver.rest(), *self._log])
+        stop = int(np.searchsorted(samples.t, self.last[0], "right"))
+        now, after = samples.rows(slice(stop)), samples.rows(slice(stop, None))
+        more, new = merged(now, late)
+        if not new.any():
+            return
+        for with_late in (True, False):  # if that fails, as it was
+            driver = opening.driver.copy()
+            driver.wait(Samples.none())
+            steps = driver.push(more if with_late else now)
+            self.stretch.rewind(opening.point)
+            if steps is None:
+                continue
+            shown = np.isin(steps.t, np.concatenate(window.t)).astype(np.uint8)
+            steps = steps._replace(drive=steps.drive._replace(shown=shown))
+            try:
+                filtered = self.stretch.advance(steps.drive)
+            except Diverged:
+                continue
+            self._left, self._steps = opening.left.copy(), opening.steps
+            self._window = self._new(window.test_point, window.begin)
+            self.account(steps, filtered)
+            break
+        driver.wait(after)
+        self.driver = driver
+        if with_late:
+            names = Counter(SENSORS[sensor] for sensor in late.sensor[new].tolist())
+            counts = ", ".join(f"{name} {names[name]}" for name in SENSORS if name in names)
+            text = f"late samples put in, the window was filtered again from its beginning: {counts}"
+            yield self._leg.epoch.event("info", text, *self.last)
 
     def account(self, steps: Steps, filtered: Filtered) -> Estimate | None:
         """Take filtered steps into the window, and make a message of those that are told."""
@@ -128,8 +211,11 @@ class Passage:
         for value in nis.tolist():
             window.nis += value
         window.dof += int(dof.sum())
-        for seconds in drive.dt[drive.bridged == 1].tolist():
+        for _, seconds in _bridged(steps):
             window.bridged += seconds
+            if seconds < TOLD_GAP:
+                window.gaps += 1
+                window.longest = max(window.longest, seconds)
         window.digest.update(np.column_stack([steps.t.view(np.float64), drive.u, drive.z, drive.r]).tobytes())
         window.t.append(steps.t[shown])
         window.t_rx.append(steps.t_rx[shown])
@@ -159,14 +245,8 @@ class Passage:
     def events(self, steps: Steps, filtered: Filtered) -> Iterator[Event]:
         """What a reader of the log should know of these steps."""
         epoch = self._leg.epoch
-        bridged = steps.drive.bridged == 1
-        if bridged.any():
-            ends = np.flatnonzero(bridged & steps.inertial)
-            for i in ends.tolist():
-                begin = i
-                while begin > 0 and bridged[begin - 1] and not steps.inertial[begin - 1]:
-                    begin -= 1
-                seconds = float(steps.drive.dt[begin : i + 1].sum())
+        for i, seconds in _bridged(steps):
+            if seconds >= TOLD_GAP:
                 text = (
                     f"{seconds:.2f} s without inertial samples: interpolated, with the variance of unknown manoeuvring"
                 )
@@ -190,6 +270,12 @@ class Passage:
                     f"(beyond 8 sigmas), {tally.weakened} weakened (beyond 5)"
                 )
                 yield self._leg.epoch.event("info", text, *self.last)
+        if window.gaps:
+            text = (
+                f"inertial samples missing in {window.gaps} places, for {window.longest:.2f} s at most: interpolated, "
+                "with the variance of unknown manoeuvring"
+            )
+            yield self._leg.epoch.event("warning", text, *self.last)
 
     def close(self, reason: Reason) -> Closed | None:
         """Close the window; None where it holds nothing."""
@@ -197,7 +283,7 @@ class Passage:
         if window is None or not any(len(t) for t in window.t):
             return None
         window.stop, window.reason = self._steps, reason
-        window.late, self.late = self.late, 0
+        window.late, self._late = self._late, {}
         window.number = self._leg.epoch.flown
         self._leg.epoch.flown += 1
         self.closed.append(window)
@@ -230,7 +316,7 @@ class Passage:
             reason=window.reason,
             scope=epoch.scope,
             measurements=window.used,
-            late={"all": window.late} if window.late else {},
+            late=window.late,
             anchors=0,
             nis=window.nis,
             dof=window.dof,

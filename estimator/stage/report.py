@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from estimator import consistency
 from estimator.consistency import Tally
-from estimator.extended import REJECTED
 from estimator.kinematics import MEASUREMENTS
 from estimator.models.flight_path import CALM, MODEL, PARAMETERS, FlightPath
+from estimator.stage.examining import EVER
+from estimator.stage.losing import LOST, loss_effect
+from estimator.stage.losing import alone as begun
 from estimator.stage.settings import STAGE
-from estimator.stretch import Smoothed, Stretch
+from estimator.stretch import Smoothed
 from telemetry.messages import Channel, Parameter, Report, Spread
 
 if TYPE_CHECKING:
@@ -31,21 +33,16 @@ OPTIMISTIC = 2.0  # the airspeed scale in turbulence is stated with so many time
 def alone(passage: Passage, window: Closed, smoothed: Smoothed) -> tuple[Floats, Floats]:
     """Mean and standard deviation of all states at the end of a window from what was measured in it alone.
 
-    Begun where the smoothed path passes, with the priors of a first start and what the gate decided on the way.
+    Begun where the smoothed path passes, with the priors of a first start and what the gate decided on the way. Where
+    that fails, the priors.
     """
-    drive, told = passage.stretch.cut(window.first, window.stop)
-    refused = told.status == REJECTED
+    stretch, drive, _ = begun(passage, window, smoothed)
     shown = np.zeros(len(drive.dt), np.uint8)
     shown[-1] = 1
-    drive = drive._replace(z=np.where(refused, np.nan, drive.z), r=told.r, shown=shown)
-    flight = passage.flight
-    values = {
-        name: float(value)
-        for name, value in zip(flight.names, smoothed.mean[window.first], strict=True)
-        if name not in PARAMETERS
-    }
-    again = Stretch(flight, flight.start(values), gated=False)
-    filtered = again.advance(drive)
+    try:
+        filtered = stretch.advance(drive._replace(shown=shown))
+    except ArithmeticError:
+        return smoothed.mean[window.stop], passage.flight.prior()  # nothing can be said
     return filtered.mean[-1], filtered.std[-1]
 
 
@@ -104,6 +101,10 @@ def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: S
         if parameter.value is not None and parameter.sigma is not None:
             epoch.found.setdefault(parameter.name, []).append((parameter.value, parameter.sigma))
     told = channels(window.tallies)
+    loss = leg.examiner.loss(int(t[0]), int(t[-1]), leg.heard)
+    effect = {}
+    if loss is not None and loss > LOST:
+        effect = loss_effect(passage, window, smoothed, leg.examiner.due(int(t[0]), int(t[-1]), leg.heard))
     return Report(
         vehicle=epoch.vehicle,
         source=STAGE,
@@ -119,9 +120,9 @@ def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: S
         parameters=found,
         channels=told,
         gaps={"interpolated": window.bridged} if window.bridged else {},
-        loss=leg.examiner.loss(int(t[0]), int(t[-1])),
-        loss_effect={},
-        findings=leg.examiner.findings(int(t[0]), int(t[-1]), leg.delay),
+        loss=loss,
+        loss_effect=effect,
+        findings=leg.examiner.findings(int(t[0]), int(t[-1]), leg.heard, leg.delay),
         alarms=alarms(told),
         digest=window.digest.hexdigest(),
     )
@@ -149,7 +150,7 @@ class Sum:
         if self.flight is None or self.flight.names != passage.flight.names:
             self.flight, self.filtered, self.smoothed = passage.flight, [], []
         if not self.tallies:
-            self.begin = int(window.t[0][0])
+            self.begin = int(np.concatenate(window.t)[0])
         first = not self.tallies
         self.tallies = (
             list(window.tallies) if first else [a + b for a, b in zip(self.tallies, window.tallies, strict=True)]
@@ -188,9 +189,9 @@ class Sum:
             parameters=parameters(self.flight, self.mean, self.std, {}),
             channels=told,
             gaps={name: seconds for name, seconds in gaps.items() if seconds},
-            loss=leg.examiner.loss(-(1 << 62), 1 << 62),
+            loss=leg.examiner.loss(self.begin, self.end[0], EVER),
             loss_effect={},
-            findings=leg.examiner.findings(-(1 << 62), 1 << 62, leg.delay),
+            findings=leg.examiner.findings(-EVER, EVER, EVER, leg.delay),
             alarms=alarms(told),
             digest=self._digest.hexdigest(),
         )

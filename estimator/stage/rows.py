@@ -33,7 +33,8 @@ def rows(message: Message) -> Rows:
             z[:, :3] = np.stack([message.latitude, message.longitude, message.altitude], axis=1)
             z[:, FIX_VELOCITY] = message.velocity
             r[:, :3] = message.sigma
-            r[:, FIX_VELOCITY] = np.square(message.sigma[:, 2:])
+            with np.errstate(over="ignore"):
+                r[:, FIX_VELOCITY] = np.square(message.sigma[:, 2:])
         case Altitude():
             sensor = ALTITUDE
             z[:, HEIGHT_COLUMN], r[:, HEIGHT_COLUMN] = message.altitude, message.sigma

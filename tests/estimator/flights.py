@@ -147,7 +147,9 @@ def flight(seed=1, count=60, mode="G", dt=0.02, missing=0.1, attitude=True, air=
     """A flight that its own model has made: truth, and a Drive with sensors of several rates and missing samples."""
     rng = np.random.default_rng(seed)
     places = {"vane": (4.0, 0.3, -0.2), "antenna": (-2.0, 0.1, -1.0)}
-    settings = Settings.fti(**{"mode": mode, "turbulence": 1.0, "turbulence_time": 3.0, **places, **changes})
+    settings = Settings.fti(
+        **{"mode": mode, "turbulence": 1.0, "turbulence_time": 3.0, "flow_tells_airspeed": True, **places, **changes}
+    )
     path = FlightPath.of(settings, 0.8, 1000.0)
     carry = path.start(start)
     model, n = path.model, path.n

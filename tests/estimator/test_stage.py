@@ -344,7 +344,7 @@ TROUBLE = {
     "wild": [*SHORT, altitude(4610.0, t_rx=1006.01)],
     "leap": moved(SHORT, 60, after=1006),
     "step back": [*moved(SHORT, -30, after=1006), mark(1002, "start", "1"), mark(1009.5, "stop", "1")],
-    "failure": [*SHORT, altitude(1006.003, np.inf), altitude(1009.003, np.inf)],
+    "nonsense": [*SHORT, altitude(1006.003, np.inf), altitude(1009.003, np.inf)],
     "long silence": [*SHORT, *later(flight(8, seed=2), 86_400), mark(1005, "start", "1")],
     "away": AWAY,
     "mark in a silence": [*flight(12, silence=[(4, 9)]), mark(1006, "start", "1")],
@@ -407,18 +407,13 @@ def test_a_burst_of_old_samples_is_late_and_nothing_more():
     assert [w.late for w in told(out, Window)] == [{"altitude": 8}]
 
 
-def test_a_failure_begins_anew_and_touches_no_other_vehicle():
-    other = flight(12, vehicle=2, seed=9)
-    out = run([*TROUBLE["failure"], *other])
-    mine = [m for m in out if m.vehicle == 1]
-    (first, second) = told([m for m in out if isinstance(m, Event) and m.level[0] == "error"], Event)
-    assert first.text[0].startswith("the estimate of vehicle 1, boot 0 failed and begins anew: z is infinite")
+def test_what_no_sensor_can_mean_is_left_out_and_said():
+    out = run(TROUBLE["nonsense"])
+    (first, count) = told([m for m in out if isinstance(m, Event) and m.level[0] == "warning"], Event)
+    assert first.text[0] == "altitude: altitude of inf m is impossible: left out"
     assert first.t[0] == round(1006.003 * S)
-    assert second.t[0] == round(1009.003 * S)
-    assert windows(mine) == [(0, "", "gap"), (1, "", "gap"), (2, "", "end")]
-    assert used(mine) > used(run(SHORT)) - 20
-    theirs = [m for m in out if m.vehicle == 2]
-    np.testing.assert_array_equal(live(theirs)["mean"], live(run(other))["mean"])
+    assert count.text[0] == "altitude: 2 samples with an impossible altitude left out"
+    np.testing.assert_array_equal(live(out)["mean"], live(run(SHORT))["mean"])
 
 
 @pytest.mark.parametrize("days", [0.01, 1, 365, 10_000])
