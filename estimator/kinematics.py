@@ -330,10 +330,10 @@ def observe_air(x: Array, r: Array, w: Array, vane: Array, y: Array, h: Array, w
 def deafen(x: Array, r: Array, h: Array) -> None:
     """Take from the rows of alpha and beta, ``h`` (3, 23) as `observe_air` leaves them, what they tell of the airspeed.
 
-    How steep the flow is beside a climb of the aircraft tells the airspeed, through the wind along the flow. An aircraft
-    that yields to gusts makes it tell it wrong: at 60 m/s in gusts of 2 m/s the airspeed scale came out wrong by 4.5 of
-    its sigmas. So the two angles are not asked: their derivatives by wind and turbulence along the horizontal flow are
-    zero. ``x`` (23,) with rotation zero, ``r`` (3, 3).
+    How steep the flow is beside a climb of the aircraft tells the airspeed, through the wind along the flow. An
+    aircraft that yields to gusts makes it tell it wrong: at 60 m/s in gusts of 2 m/s the airspeed scale came out wrong
+    by 4.5 of its sigmas. So the two angles are not asked: their derivatives by wind and turbulence along the horizontal
+    flow are zero. ``x`` (23,) with rotation zero, ``r`` (3, 3).
     """
     n1 = r[0, 0] * x[1] + r[0, 1] * x[2] + r[0, 2] * x[3] - x[WIND]
     n2 = r[1, 0] * x[1] + r[1, 1] * x[2] + r[1, 2] * x[3] - x[WIND + 1]
