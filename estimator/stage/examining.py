@@ -81,9 +81,12 @@ class Examiner:
             for finding in found
         )
 
-    def delay(self) -> float:
-        """By how much the satellite fixes are older than they say, s; 0 where that is not certain."""
-        columns, gravity = self._columns(-EVER, EVER, EVER)
+    def delay(self, since: int = -EVER) -> float:
+        """By how much the satellite fixes are older than they say, s; 0 where that is not certain.
+
+        ``since``: what was measured before this time, ns, is left alone.
+        """
+        columns, gravity = self._columns(since, EVER, EVER)
         try:
             found = self._examine(columns, gravity, 0.0)
         except (ValueError, ArithmeticError, IndexError):

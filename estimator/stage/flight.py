@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 Times = NDArray[np.int64]
 
 S = 1_000_000_000
+ASK, RECENT = 30 * S, 180 * S  # ns between two questions for the delay of the fixes, and how far back they look
 TRY = S // 2  # ns between two attempts to begin
 PATIENCE = 5 * S  # ns of vain attempts before the reason is told
 UNKNOWN_ROLL = math.radians(60.0)
@@ -69,6 +70,7 @@ class Flight:
         self._whole = epoch.scope == "sortie"
         self.examiner = Examiner(self.settings)
         self._delay: float | None = self.settings.gnss_delay
+        self._slot: int | None = None
         self._synchroniser = self._synchronise(self._delay or 0.0)
         self._recent: list[Samples] = []
         self._tried = -(1 << 62)
@@ -100,8 +102,34 @@ class Flight:
             self.examiner.take(samples, np.full(len(samples.t), -ALL))
             self._buffer.append((samples, until))
             return
-        self._push(samples)
+        if self._delay is not None:
+            self._push(samples)
+            yield from self._release(until, False)
+            return
+        slots = samples.t_rx // ASK  # live, the delay is asked for between two of them: whatever the batches, then
+        for slot in np.unique(slots).tolist():
+            if self._slot is not None and slot > self._slot:
+                yield from self._ask(slot * ASK - 1)
+            self._slot = slot
+            self._push(take(samples, slots == slot))
+            yield from self._release(min(until, (slot + 1) * ASK - 1), False)
+
+    def _ask(self, until: int) -> Iterator[Message]:
+        """Ask the newest minutes for the delay of the satellite fixes; one that is found is taken off from here on."""
         yield from self._release(until, False)
+        if self.test_point or self._delay is not None:
+            return
+        delay = self.examiner.delay(self._newest - RECENT)
+        if not delay:
+            return
+        yield from self._release(until, True)
+        why = f"satellite fixes are found to be {delay:.2f} s older than they say, which is taken off from here on"
+        if self._passage is not None:
+            yield from self._end(self._passage, why)
+        else:
+            yield self.epoch.event("info", why, *self._last)
+        self._delay, self._recent = delay, []
+        self._synchroniser = self._synchronise(delay)
 
     def finish(self, reason: Reason, until: int) -> Iterator[Message]:
         """Let everything out and close the last window."""
