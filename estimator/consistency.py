@@ -33,6 +33,7 @@ ABSENT, USED, WEAKENED, REJECTED = 0, 1, 2, 3
 LEVEL = 0.99  # of the two-sided chi-square band
 LAMP = (0.7, 1.4)  # practical limits of the mean NIS
 LAG = 0.3  # practical limit of the correlation of successive innovations
+SYSTEMATIC = (1.15, 0.15)  # NIS and correlation that together are a model that is wrong
 BITS = 0.5  # information below which a parameter was not found: `parameter`
 FAR = 4.0  # prior sigmas beyond which a parameter is no longer what the data sheet says
 APART = 3.0  # sigmas beyond which test points contradict each other
@@ -251,8 +252,9 @@ class Judged(NamedTuple):
 def judge(tally: Tally, *, air_data: bool = False, level: float = LEVEL) -> Judged:
     """Judge the innovations of one measured quantity.
 
-    Over-confident: mean NIS above the chi-square band and above 1.4. Cautious: below the band and below 0.7. Not white:
-    correlation of successive innovations beyond 0.3 and beyond ``3 / sqrt(scalars)``, three sigmas of chance.
+    Over-confident: mean NIS above the chi-square band and above 1.4; or above 1.15 while successive innovations are
+    correlated beyond 0.15 and beyond ``3 / sqrt(scalars)``, three sigmas of chance. Cautious: below the band and below
+    0.7. Not white: a correlation beyond 0.3 and beyond chance.
 
     Parameters
     ----------
@@ -269,12 +271,14 @@ def judge(tally: Tally, *, air_data: bool = False, level: float = LEVEL) -> Judg
         return Judged("no data", f"no scalar was used{refused}", None, None, None, None)
     low, high = band(tally.used, level)
     correlated = lag1 is not None and abs(lag1) > max(LAG, 3.0 / math.sqrt(tally.used))
+    least, lasting = SYSTEMATIC
+    systematic = nis > least and lag1 is not None and lag1 > max(lasting, 3.0 / math.sqrt(tally.used))
     lag = "" if lag1 is None else f", lag-1 {lag1:z.2f}"
     said = f"mean NIS {nis:.3g} of {tally.used} scalars (band {low:.2f} .. {high:.2f}){lag}"
     verdict: Literal["consistent", "over-confident", "cautious", "not white", "no data"]
-    if nis > max(high, LAMP[1]):
+    if nis > high and (nis > LAMP[1] or systematic):
         verdict = "over-confident"
-        if not correlated:
+        if not (correlated or systematic):
             advice = f"multiply its variance R by {nis:.3g} (its sigma by {math.sqrt(nis):.3g})"
         elif air_data:
             advice = "innovations are large and correlated: raise the turbulence sigma"

@@ -201,6 +201,14 @@ def test_gusts_that_are_too_weak_are_told_by_the_air_data():
     assert other.verdict == "over-confident" and "turbulence" not in other.why and "multiply" not in other.why
 
 
+def test_what_is_a_little_too_large_and_lasts_is_a_wrong_model():
+    random = np.random.default_rng(7)
+    lasting = used(1.12 * correlated(random, 0.25, 4000))
+    assert 1.15 < lasting.nis < 1.4 and judge(lasting).verdict == "over-confident"
+    white = used(1.12 * random.normal(size=4000))
+    assert 1.15 < white.nis < 1.4 and judge(white).verdict == "consistent"
+
+
 def test_an_offset_shows_as_correlation():
     judged = judge(used(0.9 + 0.5 * np.random.default_rng(6).normal(size=2000)))
     assert judged.verdict == "not white" and "offset" in judged.why
