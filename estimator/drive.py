@@ -34,7 +34,7 @@ LONGEST_GAP = 2.0  # s
 MANOEUVRE = (3.0, 0.4)  # m/s2 and rad/s: what an aircraft may do unseen
 MANOEUVRE_TIME = 0.25  # s
 REPEAT = S // 2  # ns: the same value again within this time is the old one, held
-BLIND = 15.0  # sigmas of airspeed below which the air data say nothing
+BLIND = 8.0  # sigmas of airspeed below which a pitot tube says nothing; nearer to the speed of flight it cuts off noise
 
 
 class Samples(NamedTuple):
