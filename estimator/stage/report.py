@@ -110,7 +110,7 @@ def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: S
         source=STAGE,
         boot=epoch.boot,
         t=t[-1:],
-        t_rx=window.t_rx[-1][-1:],
+        t_rx=np.concatenate(window.t_rx)[-1:],
         model=MODEL,
         test_point=window.test_point,
         scope="test point",
