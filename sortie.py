@@ -418,6 +418,14 @@ def sim(
     """
     import sims
 
+    if not 0 <= turbulence <= 7:
+        raise ValueError(f"--turbulence {turbulence}: it is 0 (calm) to 7")
+    if not all(abs(part) <= 100.0 for part in wind):
+        raise ValueError(f"--wind {wind[0]} {wind[1]}: two numbers of up to 100 m/s are needed")
+    if faults and to.endswith(".npz"):
+        raise ValueError("--faults are those of a link, and arrays have none: write to NAME.tlog or udpout:HOST:PORT")
+    if truth and truth.suffix != ".npz":
+        raise ValueError(f"--truth {truth}: it is an .npz file")
     late = {"gnss": gnss_delay} if gnss_delay else None
     dropouts = [_dropout(text) for text in dropout or ()]
     flight = sims.fly(
@@ -777,6 +785,8 @@ def _application() -> Any:
     from cyclopts import App, Parameter
 
     app = App(name="sortie", help=PURPOSE, help_format="plaintext", version=lambda: version(DISTRIBUTION))
+    sim.__annotations__["wind"] = Annotated[tuple[float, float], Parameter(negative="")]
+    sim.__annotations__["dropout"] = Annotated[list[str] | None, Parameter(negative="")]
     smooth.__annotations__["output"] = Annotated[Path | None, Parameter(name=["--output", "-o"])]
     for command in COMMANDS:
         app.command(command)

@@ -372,7 +372,8 @@ def parameter(
     gain = max(bits, 0.0)
     doubled = "" if factor == 1.0 else f" (stated with {factor:g} times its sigma)"
     if bits < BITS:
-        why = f"{gain:.2f} bit gained, below {BITS}: sigma is still {stated / prior:.2f} of what it was before{doubled}"
+        left = min(stated / prior, 1.0)
+        why = f"{gain:.2f} bit gained, below {BITS}: sigma is still {left:.2f} of what it was before{doubled}"
         return Found(None, None, gain, None, "not observable", why)
     z = _apart(value, stated, others)
     distance = abs(value) / prior

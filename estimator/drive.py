@@ -149,7 +149,7 @@ class Driver:
         self._u = u
         self._output, self._thin = output, attitude_interval
         self._pending: list[Samples] = []
-        self._static = np.nan
+        self._static = self._speed = np.nan
         self._said: dict[int, tuple[Floats, int]] = {}  # column -> what was said last, and when
         self._attitude = -(1 << 62)
         self.gap: int | None = None  # time of the last inertial sample before a gap that is too long
@@ -241,6 +241,15 @@ class Driver:
         self._u = u_end[-1].copy()
         return Steps(t, rows.t_rx, Drive(dt, u, q, fade, z, r, bridged.astype(np.uint8), shown), inertial)
 
+    def _too_slow(self, speed: Floats, blind: float) -> NDArray[np.bool_]:
+        """Where the newest airspeed known is too small for vanes to mean anything."""
+        known = ~np.isnan(speed)
+        last = np.maximum.accumulate(np.where(known, np.arange(len(speed)), -1))
+        newest = np.where(last >= 0, speed[last], self._speed)
+        if len(newest):
+            self._speed = float(newest[-1])
+        return np.asarray(newest <= blind)
+
     def _walks(self, t: Times, before: Times) -> Floats:
         """For how much time wind and biases walk at each step (N,), s: since they last did, five times a second."""
         slow = np.zeros(len(t))
@@ -255,8 +264,10 @@ class Driver:
         s = self.flight.settings
         z = rows.z[:, MEASURED : MEASURED + M].copy()
         z[:, 0] = self._airspeed(rows)
+        speed = z[:, 0].copy()
         blind = max(BLIND * s.airspeed, 0.6 * s.stall_speed)
         z[~(z[:, 0] > blind), 0] = np.nan
+        z[self._too_slow(speed, blind), 1:3] = np.nan
         self._drop_repeats(rows.t, z, 0, rows.z[:, (MEASURED, IMPACT)])
         self._drop_repeats(rows.t, z, HEIGHT, z[:, HEIGHT : HEIGHT + 1])
         if s.mode == "I":

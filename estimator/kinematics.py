@@ -19,7 +19,8 @@ the transport rate om_en cancels in v'. Shi's eq. (16) is the case without Earth
 The attitude is an error vector about a nominal quaternion, not Euler angles: a step and its Jacobian are regular at any
 pitch. The velocity is kept along the nominal axes, V = exp([a]x) (u, v, w): R(q) V is the velocity over ground whatever
 a is, so a satellite velocity says nothing about an attitude that no acceleration has shown. With (u, v, w) as the state
-an uncertain heading at high speed makes a filter believe what it cannot know (V sigma^2 / 2 against the noise). Where
+an uncertain heading at high speed makes a filter believe what it cannot know (V sigma^2 / 2 against the noise).
+Nothing of second order is cured by it: a heading that no acceleration shows for minutes is lost all the same. Where
 a state is known to be x with rotation a, the next step begins by moving a into q, and says so in its Jacobian.
 
 References

@@ -18,7 +18,7 @@ References
 
 from __future__ import annotations
 
-import os
+import hashlib
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -44,15 +44,21 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def follow(caller: str, *callees: str) -> None:
-    """Make the file ``caller``, whose kernels call those here, and those of ``callees``, at least as young as these.
+    """Forget the compiled kernels of the file ``caller`` where those here, or those of ``callees``, have changed since.
 
     numba's on-disk cache asks only whether the caller's own file has changed, and would go on running the old code of a
-    changed callee.
+    changed callee. What they were compiled from is noted beside them.
     """
+    cache = Path(caller).parent / "__pycache__"
+    note = cache / f"{Path(caller).stem}.follows"
     with suppress(OSError):
-        youngest = max(Path(path).stat().st_mtime_ns for path in (__file__, *callees))
-        if Path(caller).stat().st_mtime_ns < youngest:
-            os.utime(caller, ns=(youngest, youngest))
+        content = b"".join(Path(path).read_bytes() for path in sorted({__file__, caller, *callees}))
+        digest = hashlib.sha256(content).hexdigest()
+        if not note.exists() or note.read_text() != digest:
+            for index in cache.glob(f"{Path(caller).stem}.*.nbi"):
+                index.unlink(missing_ok=True)
+            cache.mkdir(exist_ok=True)
+            note.write_text(digest)
 
 
 @compiled

@@ -197,11 +197,12 @@ def _links(summary: Summary, console: Console) -> None:
 def _windows(summary: Summary, console: Console) -> None:
     scopes = ", ".join(sorted({w.scope for w in summary.windows}))
     known = {"window": "everything up to their closing", "sortie": "the whole boot epoch"}.get(scopes, scopes)
-    columns = "window", "test point", "from", "length>", "closed", "NIS/dof>", "altitude>", "horiz.>"
     several = len({w.vehicle for w in summary.windows}) > 1
     models = sorted({w.model for w in summary.windows}, key=first)
     for model in models:
         whose = f" of the {_plain(model.replace('_', ' '))}" if len(models) > 1 else ""
+        height = "altitude>" if model == "trajectory" else "h, noise>"  # not what the altimeter is wrong by
+        columns = "window", "test point", "from", "length>", "closed", "NIS/dof>", height, "horiz.>"
         table = _table(f"Windows{whose}, smoothed with {known}", *columns)
         for w in summary.windows:
             if w.model == model:
@@ -218,7 +219,11 @@ def _windows(summary: Summary, console: Console) -> None:
         console.print(table)
     verdicts = Counter(verdict(w.nis, w.dof) for w in summary.windows)
     innovations = ", ".join(f"{count} {word}" for word, count in verdicts.most_common())
-    console.print("  altitude, horiz.: median standard deviations; NIS/dof is 1 if the model is right", highlight=False)
+    console.print(
+        "  altitude, horiz.: median standard deviations (h: without the altimeter's offset); NIS/dof is 1 if the model "
+        "is right",
+        highlight=False,
+    )
     console.print(f"  innovations: {innovations}", highlight=False)
     late = sum(sum(w.late.values()) for w in summary.windows)
     if late:

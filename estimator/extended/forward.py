@@ -42,6 +42,7 @@ from estimator.kinematics import (
     STEEP,
     TURBULENCE,
     VELOCITY,
+    WIND,
     M,
     deafen,
     observe_air,
@@ -213,7 +214,7 @@ def forward(
                 observe_air(xm, r33, omega, model.vane, y[AIR:ATTITUDE], h[AIR:ATTITUDE], work)
                 if model.deaf:
                     deafen(xm, r33, h[AIR:ATTITUDE])
-                if xm[1] < SLOW:
+                if xm[1] - r33[0, 0] * xm[WIND] - r33[1, 0] * xm[WIND + 1] < SLOW:
                     air = False
             if attitude:
                 observe_attitude(q, y[ATTITUDE:HEIGHT], h[ATTITUDE:HEIGHT], work)

@@ -33,6 +33,7 @@ from estimator.kinematics import (
     STATES,
     STEEP,
     VELOCITY,
+    WIND,
     M,
     deafen,
     observe_air,
@@ -185,7 +186,7 @@ def forward(model: Model, drive: Drive, start: Array, room: Room) -> int:
             matrix(q1, r33)
             for j in range(3):
                 omega[j] = drive.u[i, 3 + j] - x[10 + j]
-            if seen & 1 and not x[1] < SLOW:
+            if seen & 1 and not x[1] - r33[0, 0] * x[WIND] - r33[1, 0] * x[WIND + 1] < SLOW:
                 observe_air(x, r33, omega, model.vane, y[AIR:ATTITUDE], h[AIR:ATTITUDE], work)
                 if model.deaf:
                     deafen(x, r33, h[AIR:ATTITUDE])

@@ -14,6 +14,7 @@ from estimator.kinematics import (
     STATES,
     STEEP,
     VELOCITY,
+    WIND,
     M,
     deafen,
     observe_air,
@@ -137,7 +138,8 @@ def forward(
             observe_velocity(xm, r33, omega, model.antenna, y[VELOCITY:], h[VELOCITY:])
             for c in range(M):
                 absent = drive.z[i, c] != drive.z[i, c]
-                if absent or (c < ATTITUDE and xm[1] < SLOW) or (ATTITUDE <= c < HEIGHT and abs(y[ATTITUDE]) > STEEP):
+                calm = c < ATTITUDE and xm[1] - r33[0, 0] * xm[WIND] - r33[1, 0] * xm[WIND + 1] < SLOW
+                if absent or calm or (ATTITUDE <= c < HEIGHT and abs(y[ATTITUDE]) > STEEP):
                     continue
                 z = drive.z[i, c] - y[c]
                 if 0 < c < HEIGHT:

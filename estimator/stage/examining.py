@@ -11,7 +11,7 @@ from estimator.drive import IMPACT, IMU, MEASURED, STATIC
 from estimator.kinematics import ATTITUDE as ANGLES
 from estimator.kinematics import Earth
 from estimator.models.flight_path import Settings
-from estimator.stage.rows import AIR, ALTITUDE, ATTITUDE, FIX_VELOCITY, FLOW, GNSS, HEIGHT_COLUMN, INERTIAL
+from estimator.stage.rows import AIR, ALTITUDE, ATTITUDE, FIX_VELOCITY, FLOW, GNSS, HEIGHT_COLUMN, INERTIAL, SENSORS
 from estimator.synchronise import Rows
 
 Floats = NDArray[np.float64]
@@ -27,6 +27,7 @@ KEPT = {
 }
 EVER = 1 << 62  # ns
 HOLE = 1.75  # usual intervals between two samples: from there on one is missing, and not only late
+QUIET = 5.0  # s: a longer silence of a sensor is told
 CERTAIN = 5.0  # sigmas at which a delay that was found is taken off
 
 
@@ -114,6 +115,16 @@ class Examiner:
             t = self._sensor(sensor, -EVER, stop, heard)[0]
             if len(t) >= 10:
                 found[sensor] = t[np.searchsorted(t, first) :], max(int(np.median(np.diff(t))), 1)
+        return found
+
+    def silences(self, first: int, stop: int, heard: int) -> dict[str, float]:
+        """Seconds of silences longer than `QUIET` between two times, by sensor; only of those that were silent."""
+        found = {}
+        for sensor, (t, _) in self.due(first, stop, heard).items():
+            spans = np.diff(np.concatenate([[first], t, [stop]])) * 1e-9
+            total = float(spans[spans > QUIET].sum())
+            if total and sensor != INERTIAL:
+                found[SENSORS[sensor]] = total
         return found
 
     def loss(self, first: int, stop: int, heard: int) -> float | None:

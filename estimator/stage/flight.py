@@ -27,7 +27,7 @@ from estimator.stage.examining import Examiner
 from estimator.stage.passage import Closed, Passage
 from estimator.stage.report import Sum, test_point_report
 from estimator.stage.rows import AIR, GNSS, SENSORS
-from estimator.stage.settings import Reason
+from estimator.stage.settings import Level, Reason
 from estimator.stretch import Diverged, Filtered, Smoothed, Stretch
 from estimator.synchronise import MARK, Rows, Synchroniser, concatenate, take
 from telemetry.messages import Message
@@ -40,7 +40,9 @@ Times = NDArray[np.int64]
 S = 1_000_000_000
 ASK, RECENT = 30 * S, 180 * S  # ns between two questions for the delay of the fixes, and how far back they look
 TRY = S // 2  # ns between two attempts to begin
+ASTRAY = "heading is no longer known to 25 deg"
 PATIENCE = 5 * S  # ns of vain attempts before the reason is told
+UNKNOWN_HEADING = math.radians(25.0)  # beyond it a filter begins to believe headings that nothing has measured
 UNKNOWN_ROLL = math.radians(60.0)
 DOUBTS = 6  # times that one stretch may be doubted
 PAUSE, LONGEST_PAUSE = 2 * S, 120 * S  # ns from a stretch that failed to the next, twice as long after each failure
@@ -117,7 +119,7 @@ class Flight:
     def _ask(self, until: int) -> Iterator[Message]:
         """Ask the newest minutes for the delay of the satellite fixes; one that is found is taken off from here on."""
         yield from self._release(until, False)
-        if self.test_point or self._delay is not None:
+        if self.test_point or self._delay is not None or not self.examiner.fast():
             return
         delay = self.examiner.delay(self._newest - RECENT)
         if not delay:
@@ -347,23 +349,33 @@ class Flight:
             found.append((int(np.searchsorted(doubts, DOUBTS)) + 1, words))
         roll, pitch = (passage.flight.names.index(name) for name in ("phi", "theta"))
         lost = (steps.drive.shown == 1) & (np.abs(filtered.mean[:, pitch]) < math.radians(80.0))
+        near = lost.copy()
         lost[lost] = filtered.std[lost, roll] > UNKNOWN_ROLL
         if lost.any():
             found.append((int(np.argmax(lost)) + 1, "roll is no longer known to 60 deg"))
+        if passage.flight.settings.mode != "P":
+            astray = near.copy()
+            astray[near] = filtered.std[near, passage.flight.names.index("psi")] > UNKNOWN_HEADING
+            if astray.any():
+                found.append((int(np.argmax(astray)) + 1, ASTRAY))
         return min(found) if found else (len(steps.t), None)
 
     def _fail(self, passage: Passage, why: str) -> Iterator[Message]:
         """End a stretch whose filter was lost; the next one waits the longer the sooner that happens."""
+        if why == ASTRAY:  # no fault of the filter's: nothing has shown a heading
+            yield from self._end(passage, why, level="info")
+            return
+        passage.failed = True
         sound = passage.last[0] - passage.first >= SOUND
         self._pause = PAUSE if sound else self._pause
         self._not_before = passage.last[0] + self._pause
         yield from self._end(passage, f"{why}; no other before {self._pause / S:.0f} s have passed", failed=True)
         self._pause = min(2 * self._pause, LONGEST_PAUSE)
 
-    def _end(self, passage: Passage, why: str, *, failed: bool = False) -> Iterator[Message]:
+    def _end(self, passage: Passage, why: str, *, failed: bool = False, level: Level = "warning") -> Iterator[Message]:
         """End the stretch; the next one begins when it can."""
         at, at_rx = passage.last
-        yield self.epoch.event("warning", f"the flight path ends and begins anew: {why}", at, at_rx)
+        yield self.epoch.event(level, f"the flight path ends and begins anew: {why}", at, at_rx)
         yield from self._land("gap", at, failed=failed)
 
     def _close(self, reason: Reason, when: int, *, failed: bool = False) -> Iterator[Message]:

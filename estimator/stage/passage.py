@@ -96,6 +96,7 @@ class Closed:
     nis: float = 0.0
     dof: int = 0
     bridged: float = 0.0
+    doubts: int = 0
     gaps: int = 0  # that were interpolated and not told one by one
     longest: float = 0.0  # of these, s
     late: dict[str, int] = field(default_factory=dict)
@@ -121,6 +122,7 @@ class Passage:
         self.last = (t, t_rx)
         self.first = self.begin = self.opened = t
         self.doubts = 0
+        self.failed = False
         self._late: dict[str, int] = {}
         self.closed: list[Closed] = []
         self._left = np.zeros(2)
@@ -207,6 +209,7 @@ class Passage:
             tally.add(filtered.innovation[:, channel], status[:, channel].astype(np.int64))
         for channel in FIRST_OF:
             window.used[SENSOR_OF[channel]] += int((status[:, channel] != 0).sum())
+        window.doubts += int(np.count_nonzero(filtered.doubted))
         window.used["imu"] += int(steps.inertial.sum())
         for value in nis.tolist():
             window.nis += value

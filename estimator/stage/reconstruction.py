@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -100,8 +101,15 @@ def reconstruct(
             kept: list[Message] = live if isinstance(message, Estimate) else windows  # type: ignore[assignment]
             (reports if isinstance(message, Report) else kept).append(message)  # type: ignore[arg-type]
     if not windows:
-        raise NoFlightPath(f"no flight path: {'; '.join(events) or 'no samples'}")
-    names = windows[-1].names
+        why = dict.fromkeys(text.split("alone: ", 1)[1] for text in events if text.startswith("no flight path yet"))
+        raise NoFlightPath(f"no flight path: {'; '.join(why) or 'no satellite fix, or no inertial samples'}")
+    rows = Counter({window.names: 0 for window in windows})
+    for window in windows:
+        rows[window.names] += len(window.t)
+    names = rows.most_common(1)[0][0]
+    left_out = sum(rows.values()) - rows[names]
+    if left_out:
+        events.append(f"{left_out} epochs were flown with other states (air data came or went) and are left out here")
     windows = [window for window in windows if window.names == names]
     live = [message for message in live if message.names == names]
     t = np.concatenate([window.t for window in windows])

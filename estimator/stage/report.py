@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 UNITS = ("m/s", "rad", "rad", "rad", "rad", "rad", "m", "m/s", "m/s", "m/s")
+REFUSED = 0.05  # share of refused measurements that is an alarm
 OPTIMISTIC = 2.0  # the airspeed scale in turbulence is stated with so many times its sigma: the aircraft answers gusts
 
 
@@ -76,11 +77,18 @@ def channels(tallies: Sequence[Tally]) -> tuple[Channel, ...]:
     return tuple(out)
 
 
-def alarms(told: Sequence[Channel]) -> tuple[str, ...]:
-    """What makes the error bars untrustworthy."""
-    return tuple(
-        f"over-confident about {channel.name}: {channel.why}" for channel in told if channel.verdict == "over-confident"
-    )
+def alarms(told: Sequence[Channel], doubts: int, failures: int) -> tuple[str, ...]:
+    """What makes the error bars untrustworthy: innovations, measurements refused, a filter doubted or lost."""
+    out = [f"over-confident about {one.name}: {one.why}" for one in told if one.verdict == "over-confident"]
+    for one in told:
+        share = one.rejected / (one.used + one.rejected)
+        if share > REFUSED:
+            out.append(f"{one.name}: {share:.0%} of {one.used + one.rejected} measurements were refused")
+    if doubts:
+        out.append(f"the filter was doubted {doubts} times: error bars near these times are not to be trusted")
+    if failures:
+        out.append(f"the filter was lost {failures} times, and began anew")
+    return tuple(out)
 
 
 def spreads(flight: FlightPath, filtered: Floats, smoothed: Floats) -> tuple[Spread, ...]:
@@ -119,11 +127,12 @@ def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: S
         states=spreads(flight, np.median(np.concatenate(window.std), axis=0), np.median(smoothed.std[at], axis=0)),
         parameters=found,
         channels=told,
-        gaps={"interpolated": window.bridged} if window.bridged else {},
+        gaps=({"interpolated": window.bridged} if window.bridged else {})
+        | leg.examiner.silences(int(t[0]), int(t[-1]), leg.heard),
         loss=loss,
         loss_effect=effect,
         findings=leg.examiner.findings(int(t[0]), int(t[-1]), leg.heard, leg.delay),
-        alarms=alarms(told),
+        alarms=alarms(told, window.doubts, int(passage.failed)),
         digest=window.digest.hexdigest(),
     )
 
@@ -136,7 +145,9 @@ class Sum:
         self.tallies: list[Tally] = []
         self.filtered: list[Floats] = []
         self.smoothed: list[Floats] = []
-        self.mean = self.std = np.empty(0)
+        self.found: dict[str, tuple[float, float]] = {}  # parameters: value and sigma where they were known best
+        self.doubts = 0
+        self._failed: list[Passage] = []
         self.begin = 0
         self.end = (0, 0)
         self.number = 0
@@ -157,7 +168,12 @@ class Sum:
         )
         self.filtered.append(np.median(np.concatenate(window.std), axis=0))
         self.smoothed.append(np.median(smoothed.std[at], axis=0))
-        self.mean, self.std = smoothed.mean[at[-1]], smoothed.std[at[-1]]
+        for name, value, sigma in zip(passage.flight.names, smoothed.mean[at[-1]], smoothed.std[at[-1]], strict=True):
+            if name in PARAMETERS and not sigma > self.found.get(name, (0.0, np.inf))[1]:
+                self.found[name] = float(value), float(sigma)
+        self.doubts += window.doubts
+        if passage.failed and passage not in self._failed:
+            self._failed.append(passage)
         self.end = self.last(window)
         self.number = window.number
         self.bridged += window.bridged
@@ -174,6 +190,8 @@ class Sum:
         assert self.flight is not None
         told = channels(self.tallies)
         gaps = {"interpolated": self.bridged, "lost": self.lost}
+        gaps |= leg.examiner.silences(self.begin, self.end[0], EVER)
+        found = np.array([self.found.get(name, (np.nan, np.nan)) for name in self.flight.names])
         return Report(
             vehicle=leg.epoch.vehicle,
             source=STAGE,
@@ -186,13 +204,13 @@ class Sum:
             window=self.number,
             begin=self.begin,
             states=spreads(self.flight, np.median(self.filtered, axis=0), np.median(self.smoothed, axis=0)),
-            parameters=parameters(self.flight, self.mean, self.std, {}),
+            parameters=parameters(self.flight, found[:, 0], found[:, 1], {}),
             channels=told,
             gaps={name: seconds for name, seconds in gaps.items() if seconds},
             loss=leg.examiner.loss(self.begin, self.end[0], EVER),
             loss_effect={},
             findings=leg.examiner.findings(-EVER, EVER, EVER, leg.delay),
-            alarms=alarms(told),
+            alarms=alarms(told, self.doubts, len(self._failed)),
             digest=self._digest.hexdigest(),
         )
 

@@ -32,8 +32,8 @@ class _Limit(NamedTuple):
 
 LIMITS = {
     INERTIAL: (
-        _Limit("specific force", "m/s2", tuple(range(IMU, IMU + 3)), -1000.0, 1000.0, True),
-        _Limit("angular rate", "rad/s", tuple(range(IMU + 3, IMU + 6)), -1000.0, 1000.0, True),
+        _Limit("specific force", "m/s2", tuple(range(IMU, IMU + 3)), -400.0, 400.0, True),
+        _Limit("angular rate", "rad/s", tuple(range(IMU + 3, IMU + 6)), -80.0, 80.0, True),
     ),
     ATTITUDE: (_Limit("attitude", "rad", tuple(range(MEASURED + ANGLES, MEASURED + ANGLES + 3)), -1000.0, 1000.0),),
     AIR: (

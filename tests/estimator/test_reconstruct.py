@@ -48,7 +48,7 @@ def test_without_a_path_the_error_says_why():
     flight = flown()
     with pytest.raises(NoFlightPath, match="no inertial samples"):
         estimator.reconstruct(without(messages_of(flight), Imu), settings(flight))
-    with pytest.raises(NoFlightPath, match="no samples"):
+    with pytest.raises(NoFlightPath, match="no satellite fix"):
         estimator.reconstruct([])
 
 

@@ -154,3 +154,21 @@ def test_solves_undo_multiplications(seed, n, count):
 def test_factor_knows_a_singular_matrix(matrix, singular):
     lu, order = np.empty((2, 2)), np.empty(2, np.int64)
     assert ud.factor(np.array(matrix), lu, order) is singular
+
+
+def test_compiled_code_is_forgotten_when_what_it_calls_has_changed(tmp_path):
+    caller, callee, cache = tmp_path / "caller.py", tmp_path / "callee.py", tmp_path / "__pycache__"
+    caller.write_text("one")
+    callee.write_text("two")
+    cache.mkdir()
+    index = cache / "caller.kernel-1.py311.nbi"
+    other = cache / "other.kernel-1.py311.nbi"
+    ud.follow(str(caller), str(callee))
+    for changed in (False, True):
+        index.write_text("compiled")
+        other.write_text("compiled")
+        if changed:
+            callee.write_text("three")
+        ud.follow(str(caller), str(callee))
+        assert index.exists() != changed
+        assert other.exists()
