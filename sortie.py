@@ -246,6 +246,11 @@ def smooth(
         f"{output}: {counted(len(summary.vehicles), 'vehicle')}, {counted(len(summary.windows), 'window')}, "
         f"{summary.completeness}"
     )
+    alarms, findings = (
+        sum(len(getattr(report, what)) for report in summary.reports) for what in ("alarms", "findings")
+    )
+    if tell and (alarms or findings):
+        tell(f"{counted(alarms, 'alarm')} and {counted(findings, 'finding')} in its reports: sortie review {output}")
     if witness is not None:
         _separation(log, witness, tell)
     if not summary.windows:

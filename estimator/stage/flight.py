@@ -75,6 +75,7 @@ class Flight:
         self._slot: int | None = None
         self._synchroniser = self._synchronise(self._delay or 0.0)
         self._recent: list[Samples] = []
+        self._models: dict[str, FlightPath] = {}
         self._tried = -(1 << 62)
         self._since: int | None = None
         self._told: set[str] = set()
@@ -240,7 +241,9 @@ class Flight:
         if settings.mode == "auto":
             air = bool(np.isfinite(recent.z[:, (MEASURED, IMPACT)]).any())
             settings = msgspec.structs.replace(settings, mode="G" if air else "I")
-        return FlightPath.of(settings, self.origin[0], self.origin[2])
+        if settings.mode not in self._models:
+            self._models[settings.mode] = FlightPath.of(settings, self.origin[0], self.origin[2])
+        return self._models[settings.mode]
 
     def _begin(self, recent: Samples) -> alignment.Start | str:
         if self._since is None:
