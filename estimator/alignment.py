@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.drive import IMPACT, IMU, MEASURED, STATIC, Samples
+from estimator.drive import BLIND, IMPACT, IMU, MEASURED, STATIC, Samples
 from estimator.kinematics import ATTITUDE, HEIGHT, VELOCITY
 from estimator.models.flight_path import FlightPath
 
@@ -150,7 +150,7 @@ def find(samples: Samples, flight: FlightPath, airspeed: Floats) -> Start | str:
         body = speed * np.array([math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)])
     else:
         body = turn_back @ v
-        if settings.mode == "G" and speed > max(15.0 * settings.airspeed, MOVING):
+        if settings.mode == "G" and speed > max(BLIND * settings.airspeed, MOVING):
             alpha, beta = (_last(z[:, MEASURED + i]) for i in (1, 2))
             alpha = theta if math.isnan(alpha) else alpha  # level flight, as a rule
             beta = 0.0 if math.isnan(beta) else beta

@@ -165,8 +165,9 @@ def step(
     """One midpoint step from state ``x`` (>= 13,), whose rotation is about ``q`` (4,), driven by ``u`` (6,).
 
     Fills ``x1`` (>= 13,) with the next state, its rotation zero about the next nominal attitude ``q1`` (4,); ``phi``
-    (7, 7) and ``b`` (7, 6) with the exact Jacobian of the step by (h, V, a) and by the biases, which is also that by
-    the errors of ``u``. ``work`` (200,) is scratch. What is beyond the biases is left alone.
+    (7, 7) and ``b`` (7, 6) with the Jacobian of the step by (h, V, a) and by the biases, which is also that by the
+    errors of ``u``; exact but for the transport rate, whose derivatives (dt / Earth radius) are left
+    out. ``work`` (200,) is scratch. What is beyond the biases is left alone.
     """
     r, rm = work[0:9].reshape(3, 3), work[9:18].reshape(3, 3)
     f, w, now, mid = work[18:21], work[21:24], work[24:28], work[28:32]

@@ -508,7 +508,8 @@ class Report(Message, frozen=True, kw_only=True, eq=False):
     parameters : tuple of Parameter
     channels : tuple of Channel
     gaps : dict of str to float
-        Seconds without inertial data, by what was done: "held", "interpolated", "lost" where the estimate ended.
+        Seconds without inertial data, by what was done: "interpolated", "lost" between two stretches of the estimate;
+        and longer silences of the other sensors, by their streams.
     loss : float or None
         Share of the samples due that did not come, 0..1.
     loss_effect : dict of str to float

@@ -148,6 +148,7 @@ class Sum:
         self.found: dict[str, tuple[float, float]] = {}  # parameters: value and sigma where they were known best
         self.doubts = 0
         self._failed: list[Passage] = []
+        self._passage: Passage | None = None  # the newest
         self.begin = 0
         self.end = (0, 0)
         self.number = 0
@@ -174,6 +175,9 @@ class Sum:
         self.doubts += window.doubts
         if passage.failed and passage not in self._failed:
             self._failed.append(passage)
+        if self._passage is not None and passage is not self._passage:
+            self.lost += max(passage.first - self.end[0], 0) * 1e-9
+        self._passage = passage
         self.end = self.last(window)
         self.number = window.number
         self.bridged += window.bridged
