@@ -230,7 +230,8 @@ class Stretch:
     def _about(self, found: Smoothed, block: _Block, first: int) -> About:
         stop = first + block.count
         told = block.told()
-        return About(found.x[first : stop + 1], found.q[first : stop + 1], found.w[first:stop], told.status, told.r)
+        part = found.x[first : stop + 1], found.q[first : stop + 1], found.w[first:stop]
+        return About(*part, told.status, told.r, told.doubted)
 
     def _forward(self, block: _Block, carry: Carry, about: About, rows: Rows | None, *, hidden: bool) -> None:
         drive, n = block.drive(), self.flight.n

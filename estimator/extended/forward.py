@@ -307,7 +307,7 @@ def forward(
             rows.closed[i] = 0
         told.doubted[i] = 0
         for group in range(3):
-            if lost[group]:
+            if lost[group] or (iterated and about.doubted[i] & (1 << group)):
                 told.doubted[i] |= 1 << group
                 doubt(model, carry, group, full, scratch, std)
         if drive.shown[i]:

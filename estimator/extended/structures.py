@@ -202,6 +202,7 @@ class About(NamedTuple):
     x (N+1, 23), q (N+1, 4) : states, rotation zero, and attitudes
     w (N, 6) : noise of the inertial sensors
     status, r (N, 10) : what the first pass decided about every scalar
+    doubted (N,) : where it doubted the filter, and about what
     """
 
     x: Array
@@ -209,10 +210,12 @@ class About(NamedTuple):
     w: Array
     status: Flags
     r: Array
+    doubted: Flags
 
     @classmethod
     def nothing(cls) -> About:
         """No trajectory: the filter linearises at its own estimates."""
         return cls(
-            np.empty((0, STATES)), np.empty((0, 4)), np.empty((0, B)), np.empty((0, M), np.uint8), np.empty((0, M))
+            np.empty((0, STATES)), np.empty((0, 4)), np.empty((0, B)), np.empty((0, M), np.uint8), np.empty((0, M)),
+            np.empty(0, np.uint8),
         )

@@ -260,7 +260,10 @@ def _measure(given: Record, mode: str, rounds: int) -> tuple[list[Timing], float
     rival_both()
     mine.both()
     gap = _gap(mine, room)
-    mine.about = About(mine.x.copy(), mine.q.copy(), mine.w.copy(), mine.told.status.copy(), mine.told.r.copy())
+    told = mine.told
+    mine.about = About(
+        mine.x.copy(), mine.q.copy(), mine.w.copy(), told.status.copy(), told.r.copy(), told.doubted.copy()
+    )
     tasks: dict[str, tuple[Callable[[], None], Callable[[], None] | None]] = {
         "filter and smoother, standard deviations": (mine.both, rival_both),
         "the same told at 25 Hz, as in flight": (mine.told_at_times, rival_both),

@@ -230,7 +230,7 @@ def smoothed(given, window=100, near=None, gated=False, drive=None, cuts=(), kee
     found.mean = np.empty((count + 1, n))
     extended.named(model, found.x, found.q, False, found.mean)
     found.p0 = vt.T @ (d[:, None] * vt)  # of epoch 0, where phi = I
-    found.about = extended.About(found.x, found.q, found.w, told.status, told.r)
+    found.about = extended.About(found.x, found.q, found.w, told.status, told.r, told.doubted)
     return found
 
 

@@ -391,6 +391,19 @@ def test_a_channel_that_is_locked_out_opens_the_filter_and_is_heard_again():
     assert np.isfinite(told.mean).all() and np.isfinite(told.std).all()
 
 
+def test_a_pass_about_the_result_doubts_where_the_first_one_did():
+    found = flight(4, 1100, missing=0.0, air=False)
+    z = found.drive.z.copy()
+    z[np.cumsum(found.drive.dt) > 12.0, 7:] += [3.0, 0.0, 0.0]
+    drive = found.drive._replace(z=z)
+    first = smoothed(found, 100, drive=drive, gated=True)
+    assert first.told.doubted.any()
+    again = smoothed(found, 100, first.about, drive=drive, gated=True)
+    np.testing.assert_array_equal(again.told.doubted, first.told.doubted)
+    after = int(np.flatnonzero(first.told.doubted)[-1]) + 20
+    assert again.std[after, 1] > 0.8 * first.std[after, 1]  # its variance was raised as well
+
+
 def test_doubt_is_undone_exactly_by_the_smoother():
     found = flight(4, 1100, missing=0.0, air=False)
     z = found.drive.z.copy()
