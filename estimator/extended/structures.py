@@ -216,6 +216,10 @@ class About(NamedTuple):
     def nothing(cls) -> About:
         """No trajectory: the filter linearises at its own estimates."""
         return cls(
-            np.empty((0, STATES)), np.empty((0, 4)), np.empty((0, B)), np.empty((0, M), np.uint8), np.empty((0, M)),
+            np.empty((0, STATES)),
+            np.empty((0, 4)),
+            np.empty((0, B)),
+            np.empty((0, M), np.uint8),
+            np.empty((0, M)),
             np.empty(0, np.uint8),
         )
