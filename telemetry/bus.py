@@ -29,7 +29,8 @@ import numpy as np
 import zenoh
 import zenoh.ext
 
-from telemetry.messages import Event, Message, Progress, decode, encode, event, schema
+from telemetry.messages import Event, Message, Progress, event
+from telemetry.wire import decode, encode, schema
 
 PATIENCE = 5.0
 DRAIN = 30.0

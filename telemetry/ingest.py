@@ -137,7 +137,7 @@ class _Ingest:
         self._links, self._dialect, self._settings = links, dialect, settings
         self._systems: dict[int, _System] = {}
         self._accounts = LinkAccounts()
-        self._bytes = np.zeros((len(links), 6), np.int64)
+        self._bytes = np.zeros((len(links), 7), np.int64)
         self._bytes_told = 0
         self._pending = 0
         self._reached = 0  # receive time of everything told so far
@@ -160,7 +160,7 @@ class _Ingest:
                 t=now,
                 t_rx=now,
             )
-        for link, (_, _, _, corrupt, discarded, _) in enumerate(self._bytes.tolist()):
+        for link, (_, _, _, corrupt, _, discarded, _) in enumerate(self._bytes.tolist()):
             if discarded:
                 yield event(
                     f"link {self._links[link]}: {discarded} bytes were no frame, {corrupt} frames were corrupt",
@@ -206,6 +206,7 @@ class _Ingest:
                 mine.sum(),
                 (mine & ~frames.known).sum(),
                 frames.junk_corrupt[junk].sum(),
+                0,
                 lost,
                 0,
             )
@@ -257,7 +258,7 @@ class _Ingest:
         station.marks.clear()
 
     def _account_of(self, link: int, now: NDArray[np.int64]) -> LinkBytes:
-        names = ("bytes", "frames", "unknown", "corrupt", "discarded", "pending")
+        names = ("bytes", "frames", "unknown", "corrupt", "refused", "discarded", "pending")
         columns: dict[str, Any] = {name: self._bytes[link, i : i + 1].copy() for i, name in enumerate(names)}
         if link == 0:  # only a log, which is one link, can end inside a record
             columns["pending"] += self._pending

@@ -208,5 +208,16 @@ class LinkAccounts:
             rows = account.rows()
             if len(rows.t_rx):
                 source = f"{link_names[link]}/{compid}"
-                said.append(LinkStats(vehicle=sysid, source=source, boot=boot(sysid), t=rows.t_rx, **rows._asdict()))
+                none = np.zeros(len(rows.t_rx), np.int64)
+                said.append(
+                    LinkStats(
+                        vehicle=sysid,
+                        source=source,
+                        boot=boot(sysid),
+                        t=rows.t_rx,
+                        unknown=none,
+                        redundant=none,
+                        **rows._asdict(),
+                    )
+                )
         return said

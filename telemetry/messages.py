@@ -13,16 +13,12 @@ Two times stand on every sample, both int64 nanoseconds of Unix time:
 ``t_rx``
     When the frame arrived here.
 
-On the wire a message is MessagePack; an array is ``[dtype, shape, little-endian bytes]``::
-
-    {"vehicle": 1, "source": "0/1", "boot": 0, "sequence": 17, "t": ["<i8", [3], b"..."], "t_rx": [...], ...}
-
-under the encoding ``application/msgpack;sortie.<Kind>.v1``.
+How a message travels is told in `telemetry.wire`.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -33,8 +29,6 @@ Counts = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-VERSION = 1
-
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """What every message says: who measured, in which boot epoch, when, and when we heard of it.
@@ -44,7 +38,8 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     vehicle : int
         MAVLink system id; 0 when the message is about a link or a stage rather than a vehicle.
     source : str
-        ``"link/component"`` of the sender, ``"link"`` for a whole link, or the name of the stage.
+        ``"link/component"`` of the sender, ``"link"`` for a whole link, or the name of the stage. A sender heard over
+        several links keeps the name of the first.
     boot : int
         Boot epoch of the vehicle, counted from 0 in this recording.
     t, t_rx : int64 array, shape (k,)
@@ -87,7 +82,24 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False):
                 raise ValueError(f"{type(self).__name__}.{name}: {len(value)} rows where t has {rows}")
 
 
-class Imu(Message, frozen=True, kw_only=True, eq=False):
+class Sample(Message, frozen=True, kw_only=True, eq=False):
+    """What a sensor measured.
+
+    One of several like sensors has its number in `source`: ``"link/component.instance"``, instance 0 being plain.
+
+    Parameters
+    ----------
+    chosen : bool
+        The estimator uses it. Other streams of the same kind are recorded beside it, for comparison.
+    t_sigma : float array, shape (k,), or None
+        Standard deviation of `t`, s, where the vehicle did not say when it measured; None where it did.
+    """
+
+    chosen: bool = True
+    t_sigma: Floats | None = None
+
+
+class Imu(Sample, frozen=True, kw_only=True, eq=False):
     """Inertial measurement: what accelerometers and gyros feel, body axes.
 
     Parameters
@@ -106,7 +118,7 @@ class Imu(Message, frozen=True, kw_only=True, eq=False):
     widths: ClassVar[dict[str, int | str]] = {"specific_force": 3, "angular_rate": 3}
 
 
-class Attitude(Message, frozen=True, kw_only=True, eq=False):
+class Attitude(Sample, frozen=True, kw_only=True, eq=False):
     """Attitude as the autopilot estimates it: Euler angles 3-2-1, NED to body.
 
     Parameters
@@ -123,7 +135,7 @@ class Attitude(Message, frozen=True, kw_only=True, eq=False):
     stream: ClassVar[str] = "attitude"
 
 
-class AirData(Message, frozen=True, kw_only=True, eq=False):
+class AirData(Sample, frozen=True, kw_only=True, eq=False):
     """Airspeed system.
 
     Parameters
@@ -141,7 +153,7 @@ class AirData(Message, frozen=True, kw_only=True, eq=False):
     stream: ClassVar[str] = "air_data"
 
 
-class FlowAngles(Message, frozen=True, kw_only=True, eq=False):
+class FlowAngles(Sample, frozen=True, kw_only=True, eq=False):
     """Vanes or a multi-hole probe: the direction of the flow where they stand.
 
     Parameters
@@ -157,7 +169,7 @@ class FlowAngles(Message, frozen=True, kw_only=True, eq=False):
     stream: ClassVar[str] = "flow_angles"
 
 
-class Altitude(Message, frozen=True, kw_only=True, eq=False):
+class Altitude(Sample, frozen=True, kw_only=True, eq=False):
     """Pressure altimeter.
 
     Parameters
@@ -178,7 +190,7 @@ class Altitude(Message, frozen=True, kw_only=True, eq=False):
     stream: ClassVar[str] = "altitude"
 
 
-class Gnss(Message, frozen=True, kw_only=True, eq=False):
+class Gnss(Sample, frozen=True, kw_only=True, eq=False):
     """Satellite navigation fix; only fixes that the receiver itself calls three-dimensional.
 
     Parameters
@@ -243,6 +255,9 @@ class LinkStats(Message, frozen=True, kw_only=True, eq=False):
         Distinct numbers that arrived; numbers given up; numbers that arrived after that; numbers that came after a
         higher one in time; numbers seen before; the same number with other bytes; numbers in holes too long for an
         8-bit counter to tell; restarts of the sender.
+    unknown, redundant : int64 array, shape (k,)
+        Frames of an id that the dialect does not know; frames that another link had brought before, which are used
+        once and counted on both.
     loss : float array, shape (k,)
         Over the last 10 s, 0..1.
     loss_total : float array, shape (k,)
@@ -257,6 +272,8 @@ class LinkStats(Message, frozen=True, kw_only=True, eq=False):
     conflict: Counts
     ambiguous: Counts
     restarted: Counts
+    unknown: Counts
+    redundant: Counts
     loss: Floats
     loss_total: Floats
 
@@ -271,15 +288,17 @@ class LinkBytes(Message, frozen=True, kw_only=True, eq=False):
 
     Parameters
     ----------
-    bytes, frames, unknown, corrupt, discarded, pending : int64 array, shape (k,)
+    bytes, frames, unknown, corrupt, refused, discarded, pending : int64 array, shape (k,)
         Bytes in; frames accepted; of these, frames whose id the dialect does not know; frames of a known id whose
-        checksum failed; bytes in no frame; bytes that wait for the rest of a frame.
+        checksum failed; whole frames that were refused, because of their signature; bytes in no accepted frame; bytes
+        that wait for the rest of a frame.
     """
 
     bytes: Counts
     frames: Counts
     unknown: Counts
     corrupt: Counts
+    refused: Counts
     discarded: Counts
     pending: Counts
 
@@ -541,6 +560,32 @@ class Report(Message, frozen=True, kw_only=True, eq=False):
     stream: ClassVar[str] = "report"
 
 
+class Health(Message, frozen=True, kw_only=True, eq=False):
+    """How a consumer on the bus keeps up: a row about every second, `source` being the consumer.
+
+    Parameters
+    ----------
+    stage : str
+        The stage it listens to.
+    age_p50, age_p99, age_max : float array, shape (k,)
+        From the receive time of a message's newest sample to the moment it was handed on, over that second, s.
+    messages, missing, backfilled, refused : int64 array, shape (k,)
+        Handed on so far; given up for ever; fetched again after a gap; payloads that were no message of this version.
+    """
+
+    stage: str
+    age_p50: Floats
+    age_p99: Floats
+    age_max: Floats
+    messages: Counts
+    missing: Counts
+    backfilled: Counts
+    refused: Counts
+
+    family: ClassVar[str] = "event"
+    stream: ClassVar[str] = "health"
+
+
 class Progress(Message, frozen=True, kw_only=True, eq=False):
     """Everything received up to ``t_rx[-1]`` has been told; with ``final``, nothing more will come.
 
@@ -572,72 +617,12 @@ KINDS: dict[str, type[Message]] = {
         Estimate,
         Window,
         Report,
+        Health,
         Progress,
     )
 }
 
 SENSORS = (Imu, Attitude, AirData, FlowAngles, Altitude, Gnss)
-
-
-class Array(NamedTuple):
-    """An array on the wire."""
-
-    dtype: str
-    shape: tuple[int, ...]
-    data: bytes
-
-
-_DTYPES = {"<f8", "<i8"}
-
-
-def _write_array(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        little = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
-        return Array(little.dtype.str, little.shape, little.tobytes())
-    raise NotImplementedError(f"a message cannot carry a {type(value).__name__}")
-
-
-def _read_array(kind: Any, value: Any) -> NDArray[Any]:
-    dtype, shape, data = msgspec.convert(value, Array)
-    if dtype not in _DTYPES:
-        raise ValueError(f"array of {dtype!r}: a message carries only {', '.join(sorted(_DTYPES))}")
-    wanted = kind.__args__[1].__args__[0]
-    if np.dtype(dtype) != np.dtype(wanted):
-        raise ValueError(f"array of {dtype!r} where {np.dtype(wanted).str!r} belongs")
-    if len(shape) not in (1, 2) or min(shape) < 0 or shape[0] * (shape[1] if len(shape) == 2 else 1) * 8 != len(data):
-        raise ValueError(f"array of shape {tuple(shape)} in {len(data)} bytes")
-    return np.frombuffer(data, dtype).reshape(shape)
-
-
-_encoder = msgspec.msgpack.Encoder(enc_hook=_write_array)
-_decoders = {name: msgspec.msgpack.Decoder(kind, dec_hook=_read_array) for name, kind in KINDS.items()}
-
-
-def schema(kind: type[Message]) -> str:
-    """Name of a kind and its version on the wire, e.g. ``sortie.Imu.v1``."""
-    return f"sortie.{kind.__name__}.v{VERSION}"
-
-
-def encode(message: Message) -> bytes:
-    """Turn a message into MessagePack bytes (its schema travels beside them)."""
-    return _encoder.encode(message)
-
-
-def decode(schema: str, payload: bytes) -> Message:
-    """Turn bytes from the wire into a message.
-
-    Raises
-    ------
-    ValueError
-        If the schema is not one of this version's, or the payload does not fit it; the text says which.
-    """
-    name = schema.removeprefix("sortie.").removesuffix(f".v{VERSION}")
-    if schema != f"sortie.{name}.v{VERSION}" or name not in _decoders:
-        raise ValueError(f"unknown message {schema!r}: this version reads sortie.<Kind>.v{VERSION}")
-    try:
-        return _decoders[name].decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{schema}: {error}") from None
 
 
 def event(

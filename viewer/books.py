@@ -39,8 +39,19 @@ from viewer.summary import (
 )
 from viewer.worth import worth
 
-COUNTERS = ("received", "lost", "late", "out_of_order", "duplicate", "conflict", "ambiguous", "restarted")
-BYTES = ("bytes", "frames", "unknown", "corrupt", "discarded", "pending")
+COUNTERS = (
+    "received",
+    "lost",
+    "late",
+    "out_of_order",
+    "duplicate",
+    "conflict",
+    "ambiguous",
+    "restarted",
+    "unknown",
+    "redundant",
+)
+BYTES = ("bytes", "frames", "unknown", "corrupt", "refused", "discarded", "pending")
 LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 SEVERITIES = ("CRITICAL", "CRITICAL", "CRITICAL", "ERROR", "WARN", "INFO", "INFO", "DEBUG")
 

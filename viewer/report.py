@@ -165,26 +165,40 @@ def _clock(clock: Clock) -> str:
 
 def _links(summary: Summary, console: Console) -> None:
     if summary.accounts:
-        table = _table("Links", "sender", "vehicle>", "received>", "lost>", "late>", "duplicate>", "restarts>", "loss>")
+        table = _table(
+            "Links",
+            "sender",
+            "vehicle>",
+            "received>",
+            "lost>",
+            "late>",
+            "duplicate>",
+            "redundant>",
+            "restarts>",
+            "loss>",
+        )
         notes = []
         for a in summary.accounts:
             loss = "not counted" if a.loss is None else f"{100 * a.loss:.2f} %"
-            counts = (a.vehicle, a.received, a.lost, a.late, a.duplicate, a.restarted)
+            counts = (a.vehicle, a.received, a.lost, a.late, a.duplicate, a.redundant, a.restarted)
             table.add_row(_plain(a.source), *map(str, counts), loss)
             who = f"  {a.source} of vehicle {a.vehicle}:"
             if a.ambiguous:
                 notes.append(f"{who} {a.ambiguous} lost in holes too long for an 8-bit counter to tell their length")
             if a.conflict:
                 notes.append(f"{who} {a.conflict} frames bore the number of another frame")
+            if a.unknown:
+                notes.append(f"{who} {a.unknown} frames of ids that the dialect does not know")
         console.print(table)
         for note in notes:
             console.print(note, highlight=False, markup=False)
     if summary.byte_accounts:
-        table = _table("Bytes", "link", "bytes>", "frames>", "unknown>", "corrupt>", "discarded bytes>", "pending>")
+        table = _table(
+            "Bytes", "link", "bytes>", "frames>", "unknown>", "corrupt>", "refused>", "discarded bytes>", "pending>"
+        )
         for b in summary.byte_accounts:
-            table.add_row(
-                _plain(b.source), *map(str, (b.bytes, b.frames, b.unknown, b.corrupt, b.discarded, b.pending))
-            )
+            counts = (b.bytes, b.frames, b.unknown, b.corrupt, b.refused, b.discarded, b.pending)
+            table.add_row(_plain(b.source), *map(str, counts))
         console.print(table)
     if summary.age is not None:
         console.print(

@@ -121,6 +121,8 @@ class Account(msgspec.Struct, kw_only=True):
     ambiguous: int
     restarted: int
     loss: float | None
+    unknown: int = 0
+    redundant: int = 0
 
 
 class ByteAccount(msgspec.Struct, kw_only=True):
@@ -133,6 +135,7 @@ class ByteAccount(msgspec.Struct, kw_only=True):
     corrupt: int
     discarded: int
     pending: int
+    refused: int = 0
 
 
 class Smoothed(msgspec.Struct, kw_only=True):

@@ -20,7 +20,7 @@ import numpy as np
 from estimator.stage.epoch import TAKEN, Epoch
 from estimator.stage.settings import STAGE, Scope, Settings
 from estimator.stretch import Stretch
-from telemetry.messages import AirData, Altitude, Attitude, FlowAngles, Gnss, Imu, Message, Progress
+from telemetry.messages import AirData, Altitude, Attitude, FlowAngles, Gnss, Imu, Message, Progress, Sample
 
 __all__ = ["STAGE", "Scope", "Settings", "estimate", "warm_up"]
 
@@ -54,6 +54,8 @@ def estimate(
     vehicles: dict[int, dict[int, Epoch]] = {}
     for message in _ended(messages):
         if isinstance(message, TAKEN):
+            if isinstance(message, Sample) and not message.chosen:
+                continue
             epochs = vehicles.setdefault(message.vehicle, {})
             if message.boot not in epochs:
                 epochs[message.boot] = Epoch(message.vehicle, message.boot, settings, scope)

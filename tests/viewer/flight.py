@@ -211,7 +211,9 @@ def links(vehicle: int = 1) -> list[m.Message]:
     """Link accounts, once a second, and clock fits."""
     s = times(1.0)
     n = np.arange(len(s), dtype=np.int64)
-    count = dict.fromkeys(("late", "out_of_order", "duplicate", "conflict", "ambiguous", "restarted"), n * 0)
+    count = dict.fromkeys(
+        ("late", "out_of_order", "duplicate", "conflict", "ambiguous", "restarted", "unknown", "redundant"), n * 0
+    )
     lost = n * 2 + np.where(s > 80, 40, 0)
     stats = m.LinkStats(
         received=n * 50,
@@ -227,6 +229,7 @@ def links(vehicle: int = 1) -> list[m.Message]:
         frames=n * 50,
         unknown=n,
         corrupt=n // 10,
+        refused=n * 0,
         discarded=n * 3,
         pending=zero,
         **base(s, vehicle=0, source="0"),
