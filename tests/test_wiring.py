@@ -6,7 +6,8 @@ import threading
 
 import pytest
 
-from wiring import Failure, ahead, configure
+from configuration import Failure, configure
+from wiring import ahead
 
 
 def test_what_is_worked_out_ahead_comes_in_order():

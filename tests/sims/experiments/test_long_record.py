@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-import sortie
+import bench
 from sims.experiments import long_record
 
 
@@ -46,4 +46,4 @@ def test_as_few_steps_as_tell_the_states_are_enough_and_fewer_are_refused():
     with pytest.raises(ValueError, match="steps is 3: 12 states need 4 steps of 3 measurements at least"):
         long_record.run(3)
     with pytest.raises(ValueError, match="--steps is 3: at least 4 are needed, 3 measurements each for 12 states"):
-        sortie.bench_long(steps=3)
+        bench.long(steps=3)

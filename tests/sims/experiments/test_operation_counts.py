@@ -5,7 +5,7 @@ import json
 import pytest
 from rich.console import Console
 
-import sortie
+import bench
 from sims.experiments import shi
 from sims.experiments.counting import Operations
 from sims.experiments.operation_counts import (
@@ -172,7 +172,7 @@ def test_everything_can_be_printed_and_written(small, capsys):
 
 def test_the_command_prints_json(small, monkeypatch, capsys):
     monkeypatch.setattr("sims.experiments.operation_counts.tables", lambda told: small)
-    sortie.reproduce_shi(json=True)
+    bench.shi(json=True)
     assert json.loads(capsys.readouterr().out)["caveats"] == list(small.caveats)
-    sortie.reproduce_shi()
+    bench.shi()
     assert "Table 5" in capsys.readouterr().out
