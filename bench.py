@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from configuration import Failure, say
-from wiring import smooth_log
+from offline import smooth_log
+from telling import Failure, say
 
 
 def smooth(log: Path | None = None) -> None:
@@ -230,8 +230,39 @@ def withheld(*log: Path, json: bool = False) -> None:
     Console(highlight=False, width=max(Console().width, 170)).print(table(found))
 
 
+def decode(*log: Path, dialect: str = "ardupilotmega", rounds: int = 3, json: bool = False) -> None:
+    """Messages per second of our decoders and of pymavlink's, DFReader's and pyulog's, and what a live message costs.
+
+    Parameters
+    ----------
+    log
+        .tlog, DataFlash or ULog files; a simulated flight if not given.
+    dialect
+        MAVLink dialect of the .tlog files.
+    rounds
+        The least CPU time of so many counts.
+    json
+        Print JSON instead of tables.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from sims.experiments.decode_speed import compare
+
+    found = compare(log, dialect=dialect, rounds=rounds, tell=say)
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+        return
+    console = Console(highlight=False, width=max(Console().width, 140))
+    for what, value in found.machine.items():
+        console.print(f"{what}: {value}", markup=False)
+    for table in found.tables():
+        console.print(table)
+
+
 BENCHMARKS: dict[str, Callable[..., None]] = {
     "smooth": smooth,
+    "decode": decode,
     "linear": linear,
     "extended": extended,
     "long": long,

@@ -5,27 +5,19 @@ Nothing heavy is imported before it is needed.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+from telling import Failure
 
 DISTRIBUTION = "sortie-telemetry"
 
 
-class Failure(Exception):
-    """The work failed, for a reason that one line can tell."""
-
-
-def say(text: str) -> None:
-    """Tell the user something that is not the result."""
-    print(text, file=sys.stderr, flush=True)
-
-
-def configure(path: Path | None) -> Any:
-    """Settings of the stages, from a TOML file with the tables [ingest] and [estimate].
+def configure(path: Path | None, dialect: str | None = None) -> Any:
+    """Settings of the stages, from a TOML file with the tables [ingest] and [estimate]; `dialect` replaces its own.
 
     A ``grade`` in [estimate.flight_path] stands for all settings of that grade of sensors; what is given beside it
     replaces one of them.
@@ -34,6 +26,8 @@ def configure(path: Path | None) -> Any:
 
     import estimator.stage
     import telemetry.ingest
+    from telemetry.mavlink import Dialect
+    from telemetry.sensors import check
     from telemetry.text import check_mark
 
     kind = msgspec.defstruct(
@@ -45,18 +39,27 @@ def configure(path: Path | None) -> Any:
         forbid_unknown_fields=True,
         frozen=True,
     )
-    if path is None:
-        return kind()
     try:
-        told = msgspec.toml.decode(path.read_bytes())
+        told = msgspec.toml.decode(path.read_bytes()) if path else {}
         flight = told.get("estimate", {}).get("flight_path", {})
         if "grade" in flight:
             told["estimate"]["flight_path"] = _graded(flight)
-        configuration: Any = msgspec.convert(told, type=kind)
+        configuration = _speaking(msgspec.convert(told, type=kind), dialect)
         check_mark(configuration.ingest.mark)
+        check(configuration.ingest.sensors, Dialect(configuration.ingest.dialect))
     except ValueError as error:  # msgspec's own are among them
-        raise Failure(f"{path}: {error}") from None
+        raise Failure(f"{path}: {error}" if path else str(error)) from None
     return configuration
+
+
+def _speaking(configuration: Any, dialect: str | None) -> Any:
+    """The settings, with another dialect."""
+    import msgspec
+
+    if dialect is None:
+        return configuration
+    ingest = msgspec.structs.replace(configuration.ingest, dialect=dialect)
+    return msgspec.structs.replace(configuration, ingest=ingest)
 
 
 def _graded(given: dict[str, Any]) -> dict[str, Any]:
@@ -72,13 +75,16 @@ def _graded(given: dict[str, Any]) -> dict[str, Any]:
     return whole | {key: value for key, value in given.items() if key != "grade"}
 
 
-def write_what_runs(folder: Path, name: str, endpoints: Sequence[str], configuration: Any, dialect: Any) -> None:
+def write_what_runs(
+    folder: Path, name: str, endpoints: Sequence[str], forward: Sequence[str], configuration: Any, dialect: Any
+) -> None:
     """Leave sortie.toml in a sortie folder."""
     import msgspec
 
     what = {
         "sortie": name,
         "endpoints": list(endpoints),
+        "forward": list(forward),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {
             package: version(package) for package in (DISTRIBUTION, "pymavlink", "eclipse-zenoh", "rerun-sdk")
@@ -96,17 +102,30 @@ def _told(value: Any) -> Any:
     return value
 
 
-def read_what_ran(folder: Path) -> tuple[str, int, Any]:
-    """Name, number of links and settings of a sortie folder."""
+class Ran(NamedTuple):
+    """What ran in a sortie folder."""
+
+    sortie: str
+    endpoints: list[str]
+    forward: list[str]
+    configuration: Any
+
+    @property
+    def links(self) -> int:
+        """How many links its raw log tells apart."""
+        return len(self.endpoints) + len(self.forward)
+
+
+def read_what_ran(folder: Path) -> Ran:
+    """Read the sortie.toml of a sortie folder."""
     import msgspec
 
     path = folder / "sortie.toml"
     if not path.is_file():
         raise Failure(f"{folder} is no sortie folder: it has no sortie.toml")
-    ran = msgspec.toml.decode(path.read_bytes())
-    return ran["sortie"], len(ran["endpoints"]), msgspec.convert(ran["settings"], type(configure(None)))
-
-
-def counted(number: int, what: str) -> str:
-    """A number of things, in words."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
+    try:
+        ran = msgspec.toml.decode(path.read_bytes())
+        settings = msgspec.convert(ran["settings"], type(configure(None)))
+        return Ran(ran["sortie"], ran["endpoints"], ran.get("forward", []), settings)
+    except (ValueError, KeyError) as error:
+        raise Failure(f"{path} is damaged: {error}") from None

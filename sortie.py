@@ -10,25 +10,19 @@ import inspect
 import json
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from bench import BENCHMARKS, REPRODUCTIONS
-from configuration import DISTRIBUTION, Failure, configure, counted, say, write_what_runs
-from wiring import (
-    follow,
-    new_folder,
-    open_log,
-    open_source,
-    record_folder,
-    refuse_loss,
-    smooth_log,
-    stop_on_signals,
-    watch,
-)
+from configuration import DISTRIBUTION, configure
+from live import Reception, follow, new_folder, record_lives, stop_on_signals
+from offline import open_log, smooth_log
+from telling import Failure, counted, say, watch
 
 if TYPE_CHECKING:
     from telemetry.messages import Message
@@ -38,12 +32,56 @@ DEMO_FAULTS = "loss=0.005,outage=100:6"
 DEMO_SPEED = 8.0
 
 
+@dataclass(frozen=True)
+class Receive:
+    """How telemetry is received.
+
+    Parameters
+    ----------
+    forward
+        Where ground stations are, e.g. udpout:127.0.0.1:14551: they get every byte, and what they say goes to the
+        vehicles; may be given again.
+    dialect
+        MAVLink dialect, one that pymavlink ships; that of the settings if not given.
+    signing_key
+        File with the key that frames must be signed with: a passphrase, or 64 hexadecimal digits.
+    accept_unsigned
+        Let unsigned frames pass all the same.
+    resume
+        Go on with the sortie that is in the folder.
+    idle
+        Stop by itself after so many seconds without telemetry.
+    """
+
+    forward: list[str] = field(default_factory=list)
+    dialect: str | None = None
+    signing_key: Path | None = None
+    accept_unsigned: bool = False
+    resume: bool = False
+    idle: float | None = None
+
+    def begin(self, folder: Path, name: str, endpoints: Sequence[str], config: Path | None) -> Reception:
+        """Listen, and archive what comes into the folder of a sortie."""
+        if self.resume and (config or self.dialect):
+            raise Failure("--resume goes on with the settings that ran, without --config and --dialect")
+        return Reception(
+            folder,
+            name,
+            endpoints,
+            configure(config, self.dialect),
+            forward=self.forward,
+            resume=self.resume,
+            signing_key=self.signing_key,
+            accept_unsigned=self.accept_unsigned,
+        )
+
+
 def live(
     *endpoint: str,
     sortie: str | None = None,
     folder: Path | None = None,
     config: Path | None = None,
-    idle: float | None = None,
+    receive: Receive = Receive(),
 ) -> None:
     """Follow a flight: archive, estimate, smooth and record what arrives, until Ctrl-C.
 
@@ -52,38 +90,46 @@ def live(
     Parameters
     ----------
     endpoint
-        Where telemetry comes from: udpin:HOST:PORT listens, udpout:HOST:PORT calls.
+        Where telemetry comes from: udpin:HOST:PORT listens, udpout:HOST:PORT calls, tcp:HOST:PORT connects,
+        tcpin:HOST:PORT accepts, serial:DEVICE:BAUD.
     sortie
         Name of the sortie; its start time if not given.
     folder
         Where to write; sorties/NAME if not given.
     config
         TOML file with settings.
-    idle
-        Stop by itself after so many seconds without telemetry.
     """
-    if not endpoint:
+    if not endpoint and not receive.resume:
         raise Failure("say where telemetry comes from, e.g. sortie live udpin:127.0.0.1:14550")
-    name, folder = new_folder(sortie, folder)
-    configuration = configure(config)
+    name, folder = new_folder(sortie, folder, resume=receive.resume)
+    reception = receive.begin(folder, name, endpoint, config)
+    where = ", ".join(reception.endpoints)
+    again = f"; goes on after {reception.raw_log.size} bytes" if receive.resume else ""
     summary = follow(
-        endpoint,
+        reception,
         name,
         folder,
-        configuration,
-        idle,
-        lambda: say(f"{name}: listening on {', '.join(endpoint)}; writing to {folder}; Ctrl-C ends"),
+        receive.idle,
+        lambda: say(f"{name}: listening on {where}; writing to {folder}{again}; Ctrl-C ends"),
         say,
+        again=receive.resume,
     )
     say(f"{folder}: {summary.completeness}; look at it with: sortie review {folder}")
     if not summary.vehicles:
-        raise Failure(f"nothing was received on {', '.join(endpoint)}")
+        raise Failure(f"nothing was received on {where}")
 
 
 def ingest(
-    *endpoint: str, sortie: str, folder: Path, listen: str = BUS, config: Path | None = None, idle: float | None = None
+    *endpoint: str,
+    sortie: str,
+    folder: Path,
+    listen: str | None = None,
+    connect: str | None = None,
+    credentials: Path | None = None,
+    config: Path | None = None,
+    receive: Receive = Receive(),
 ) -> None:
-    """The first of three processes: receive, archive and publish samples; carries the bus.
+    """The first of three processes: receive, archive and publish samples; carries the bus, unless a router does.
 
     Parameters
     ----------
@@ -94,41 +140,40 @@ def ingest(
     folder
         Where raw.tlog goes.
     listen
-        Endpoint of the bus for the other processes.
+        Endpoint of the bus for the other processes; tcp/127.0.0.1:7447 if neither is given.
+    connect
+        Endpoint of the router that carries the bus.
+    credentials
+        Folder of certificates, for a bus that leaves this machine.
     config
         TOML file with settings.
-    idle
-        Stop by itself after so many seconds without telemetry.
     """
-    import telemetry.ingest
     from telemetry.bus import Bus, publish
-    from telemetry.mavlink import Dialect
 
-    if not endpoint:
+    if not endpoint and not receive.resume:
         raise Failure("say where telemetry comes from, e.g. sortie ingest udpin:127.0.0.1:14550 --sortie S --folder F")
-    configuration = configure(config)
+    if listen and connect:
+        raise Failure("--listen carries the bus and --connect joins one: give one of them")
+    bus_at = connect or listen or BUS
+    carries, joins = ([], [connect]) if connect else ([bus_at], [])
+    role = "ingest" if connect else "router"
     name, folder = new_folder(sortie, folder, shared=True)
-    dialect = Dialect(configuration.ingest.dialect)
-    telemetry.ingest.warm_up(dialect)
-    with Bus(name, listen=[listen]) as bus:
-        source, raw_log = open_source(endpoint, dialect, folder)
+    with Bus(name, listen=carries, connect=joins, credentials=credentials, role=role) as bus:
+        reception = receive.begin(folder, name, endpoint, config)
         try:
-            write_what_runs(folder, name, endpoint, configuration, dialect)
-            stop_on_signals(source.stop)
-            say(f"{name}: listening on {', '.join(endpoint)}, bus on {listen}")
-            messages = telemetry.ingest.ingest(source.batches(idle), source.links, dialect, configuration.ingest)
-            messages = telemetry.ingest.guarded(messages, raw_log, lambda: source.dropped)
-            drained = publish(bus, "ingest", watch(messages, say))
+            stop_on_signals(reception.source.stop)
+            say(f"{name}: listening on {', '.join(reception.endpoints)}, bus on {bus_at}")
+            messages = watch(reception.messages(receive.idle), say, since=reception.since)
+            drained = publish(bus, "ingest", messages)
             bus.linger()  # the others still talk to one another over the bus that is carried here
             if not drained:
                 raise Failure("a consumer on the bus had not processed everything in time; the raw log is whole")
         finally:
-            source.stop()
-            source.join()
-    refuse_loss(raw_log)
+            reception.close()
+    reception.refuse_loss()
 
 
-def estimate(*, sortie: str, connect: str = BUS, config: Path | None = None) -> None:
+def estimate(*, sortie: str, connect: str = BUS, credentials: Path | None = None, config: Path | None = None) -> None:
     """The second of three processes: samples to estimates and windows.
 
     Parameters
@@ -137,26 +182,30 @@ def estimate(*, sortie: str, connect: str = BUS, config: Path | None = None) -> 
         Name of the sortie.
     connect
         Endpoint of the bus.
+    credentials
+        Folder of certificates, for a bus that leaves this machine.
     config
         TOML file with settings.
     """
     import estimator.stage
-    from telemetry.bus import Bus, publish
+    from telemetry.bus import Bus, serve
 
     configuration = configure(config)
     estimator.stage.warm_up()
-    with Bus(sortie, connect=[connect]) as bus:
-        subscription = bus.subscribe("estimate", ["ingest"])
-        stop_on_signals(subscription.stop)
+
+    def stage(messages: Iterable[Message]) -> Iterator[Message]:
+        return estimator.stage.estimate(watch(messages, say, every=False), configuration.estimate)
+
+    with Bus(sortie, connect=[connect], credentials=credentials, role="estimate") as bus:
         say(f"{sortie}: estimating on {connect}")
-        samples = watch((message for message in subscription if message is not None), say, every=False)
-        drained = publish(bus, "estimate", estimator.stage.estimate(samples, configuration.estimate))
-        subscription.close()
-        if not drained:
+        started = lambda subscription: stop_on_signals(subscription.stop)  # noqa: E731
+        if not serve(bus, "estimate", ["ingest"], stage, started=started):
             raise Failure("a consumer on the bus had not processed every estimate in time, or the bus is gone")
 
 
-def record(folder: Path, *, sortie: str, connect: str = BUS) -> None:
+def record(
+    folder: Path, *, sortie: str, connect: str = BUS, credentials: Path | None = None, resume: bool = False
+) -> None:
     """The third of three processes: write the recording.
 
     Parameters
@@ -167,16 +216,105 @@ def record(folder: Path, *, sortie: str, connect: str = BUS) -> None:
         Name of the sortie.
     connect
         Endpoint of the bus.
+    credentials
+        Folder of certificates, for a bus that leaves this machine.
+    resume
+        Put the recordings in the place of those of before, which they hold too.
     """
     from telemetry.bus import Bus
 
     name, folder = new_folder(sortie, folder, shared=True)
-    with Bus(name, connect=[connect]) as bus:
-        subscription = bus.subscribe("record", ["ingest", "estimate"])
+    with Bus(name, connect=[connect], credentials=credentials, role="record") as bus:
+        subscription = bus.subscribe("record", ["ingest", "estimate"], health=True)
         say(f"{name}: recording from {connect} into {folder}")
         stop_on_signals(subscription.stop)
-        record_folder(watch((m for m in subscription if m is not None), say), folder, name, {"bus": connect})
+        told = partial(watch, tell=say)
+        record_lives(subscription, folder, name, {"bus": connect}, through=told, resume=resume)
         subscription.close()
+
+
+def router(*, listen: list[str], credentials: Path | None = None, zenohd: bool = False) -> None:
+    """Carry the bus between machines when no stage shall, until Ctrl-C.
+
+    Parameters
+    ----------
+    listen
+        Endpoints, e.g. tls/10.0.0.1:7447; off this machine only with certificates.
+    credentials
+        Folder of certificates: who shows none of them is refused, and a certificate allows what its role needs.
+    zenohd
+        Print the same as a configuration for any zenohd (zenohd -c FILE) and do nothing else.
+    """
+    from telemetry.bus.router import router_file, serve_router
+
+    if zenohd:
+        print(router_file(listen, credentials), end="")
+        return
+    stop = threading.Event()
+    stop_on_signals(stop.set)
+    serve_router(listen, credentials, stop=stop, ready=lambda: say(f"carrying the bus on {', '.join(listen)}"))
+
+
+def keys(folder: Path, *, host: list[str] | None = None, days: float = 365.0) -> None:
+    """Make certificates for a bus that leaves this machine: one for every role, and the authority that signs them.
+
+    Parameters
+    ----------
+    folder
+        Where they go; each machine gets ca.pem and the two files of its own roles, and never the authority.
+    host
+        Name or address at which the router is called; may be given again. localhost and 127.0.0.1 always work.
+    days
+        How long they are good for.
+    """
+    from telemetry.keys import HOSTS, create
+
+    for path in create(folder, hosts=[*HOSTS, *(host or ())], days=days):
+        print(path)
+
+
+def doctor(
+    *endpoint: str,
+    folder: Path = Path("sorties"),
+    connect: list[str] | None = None,
+    credentials: Path | None = None,
+    json: bool = False,
+) -> None:
+    """Look for what would stop a flight today: versions, ports, clocks, disk, bus.
+
+    Parameters
+    ----------
+    endpoint
+        Where telemetry would come from.
+    folder
+        Where sorties would be written.
+    connect
+        Endpoint of the router of the bus.
+    credentials
+        Folder of certificates.
+    json
+        Print JSON instead of a table.
+    """
+    import msgspec
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from telemetry.doctor import examine
+
+    role = "viewer" if credentials else None
+    compiled = ("telemetry.ingest", "telemetry.archive", "estimator.stage")
+    found = examine(folder, endpoint, connect or (), credentials=credentials, role=role, compiled=compiled)
+    if json:
+        print(msgspec.json.format(msgspec.json.encode([one._asdict() for one in found])).decode())
+    else:
+        table = Table(box=None, show_header=False)
+        style = {"ok": "green", "warning": "yellow", "error": "red"}
+        for level, what, text in found:
+            table.add_row(Text(level, style[level]), what, Text(text))
+        Console().print(table)
+    if errors := [one for one in found if one.level == "error"]:
+        raise Failure(f"{counted(len(errors), 'thing')} would stop a flight: {', '.join(one.what for one in errors)}")
 
 
 def mark(action: Literal["start", "stop"], name: str, *, to: str = "udpout:127.0.0.1:14550", vehicle: int = 0) -> None:
@@ -207,6 +345,7 @@ def smooth(
     output: Path | None = None,
     test_points: Path | None = None,
     config: Path | None = None,
+    dialect: str | None = None,
     bias_separation: bool = False,
     quiet: bool = False,
 ) -> None:
@@ -215,19 +354,21 @@ def smooth(
     Parameters
     ----------
     log
-        A .tlog file, or a sortie folder.
+        A .tlog, ArduPilot DataFlash (.bin, .log) or PX4 ULog (.ulg) file, or a sortie folder.
     output
         The recording to write; NAME.rrd in this folder if not given.
     test_points
         TOML or CSV file of test points (name, start, stop, vehicle), beside those that the log itself marks.
     config
         TOML file with settings.
+    dialect
+        MAVLink dialect, one that pymavlink ships; that of the settings if not given.
     bias_separation
         Also estimate biases and scale errors beside the states, as in Shi's eq. (17), and print both.
     quiet
         Say nothing but the result.
     """
-    configuration = configure(config) if config else None
+    configuration = configure(config, dialect) if config or dialect else None
     output = output or Path(log.resolve().name).with_suffix(".rrd")
     points = []
     if test_points:
@@ -320,17 +461,16 @@ def verify(folder: Path) -> None:
         A sortie folder.
     """
     from estimator.stage import estimate
-    from telemetry.ingest import ingest
     from telemetry.messages import Estimate, Window
     from viewer.review import compare
 
-    source, dialect, configuration = open_log(folder, None)
+    if not folder.is_dir():
+        raise Failure(f"{folder} is no sortie folder: only a sortie that was followed live can be verified")
+    log = open_log(folder)
     counts = {"estimates": 0, "windows": 0}
 
     def replayed() -> Iterator[Message]:
-        for message in estimate(
-            ingest(source.batches(), source.links, dialect, configuration.ingest), configuration.estimate
-        ):
+        for message in estimate(log.messages(), log.configuration.estimate):
             if isinstance(message, Estimate):
                 counts["estimates"] += len(message.t)
             elif isinstance(message, Window):
@@ -363,8 +503,8 @@ def replay(log: Path, *, to: str, speed: float = 1.0, faults: str | None = None)
     """
     import sims
 
-    source, _, _ = open_log(log, None)
-    frames = ((int(batch.t_rx[i]), batch.frame(i)) for batch in source.batches() for i in range(len(batch)))
+    batches = open_log(log, flight=True).source.batches()
+    frames = ((int(batch.t_rx[i]), batch.frame(i)) for batch in batches for i in range(len(batch)))
     sent = sims.send(frames, to, speed=speed, faults=faults)
     print(f"{counted(sent.datagrams, 'frame')} to {to} in {sent.took:.1f} s")
 
@@ -500,10 +640,9 @@ def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED) -> None:
         sender.start()
 
     follow(
-        [endpoint],
+        Reception(folder, name, [endpoint], configure(None)),
         name,
         folder,
-        configure(None),
         2.0,
         ready,
         lambda text: console.print("  " + text, markup=False),
@@ -538,6 +677,9 @@ COMMANDS: tuple[Callable[..., None], ...] = (
     ingest,
     estimate,
     record,
+    router,
+    keys,
+    doctor,
 )
 PURPOSE = "Turn the telemetry of a test flight into a trustworthy flight path while the aircraft still flies."
 
@@ -560,6 +702,9 @@ def _application() -> Any:
     from cyclopts import App, Parameter
 
     app = App(name="sortie", help=PURPOSE, help_format="plaintext", version=lambda: version(DISTRIBUTION))
+    for command in (live, ingest):
+        command.__annotations__["receive"] = Annotated[Receive, Parameter(name="*")]
+    Receive.__annotations__["forward"] = Annotated[list[str], Parameter(negative="")]
     sim.__annotations__["wind"] = Annotated[tuple[float, float], Parameter(negative="")]
     sim.__annotations__["dropout"] = Annotated[list[str] | None, Parameter(negative="")]
     smooth.__annotations__["output"] = Annotated[Path | None, Parameter(name=["--output", "-o"])]

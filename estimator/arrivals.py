@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.geodesy import to_earth
-from estimator.synchronise import MARK, Rows, concatenate, take
+from estimator.synchronise import MARK, Rows, Times, Watermark, concatenate, in_order, take
+from estimator.ud import compiled
 
 S = 1_000_000_000
 LEAP = 10 * S  # further ahead of the newest time than this is to be confirmed; so far apart the confirming ones may be
@@ -67,10 +68,9 @@ class Piece(NamedTuple):
     judged: Rows
     places: NDArray[np.int64]
 
-    def row(self, t: int) -> int:
-        """The row judged by whose arrival the time `t` was reached."""
-        seen = np.maximum.accumulate(np.where(self.rows.sensor == MARK, np.iinfo(np.int64).min, self.rows.t))
-        reached = self.places[np.searchsorted(seen, t) :]
+    def row(self, watermark: Watermark, t: int) -> int:
+        """The row judged by whose arrival the time `t` was passed, given what had been passed before."""
+        reached = self.places[watermark.row(self.rows.t, self.rows.sensor, t) :]
         return int(reached[0]) if len(reached) else len(self.judged.t)
 
 
@@ -113,9 +113,11 @@ class Arrivals:
             return None
         rows = concatenate(self._waiting)
         now = rows.t_rx <= until
-        self._waiting = [] if now.all() else [take(rows, ~now)]
-        rows = take(rows, now)
-        return take(rows, np.lexsort((rows.sensor, rows.t, rows.t_rx)))
+        if now.all():
+            self._waiting = []
+        else:
+            self._waiting, rows = [take(rows, ~now)], take(rows, now)
+        return in_order(rows)
 
     def forget(self) -> None:
         """End the leg: the next fix begins another."""
@@ -136,6 +138,8 @@ class Arrivals:
             place, first = (latitude, longitude, altitude), found
             self._origin = tuple(to_earth(rows.z[found, 0], rows.z[found, 1], rows.z[found, 2]).tolist())
             self._newest, self._far = int(rows.t[found]), False
+        elif (plain := self._all_plain(rows)) is not None:
+            return Piece(None, rows, False, take(rows, plain[:0]), notes, rows, plain)
         index, times, end, over = self._walk(rows, first, final, notes)
         if over:
             self.forget()
@@ -148,6 +152,24 @@ class Arrivals:
             believed, index = concatenate([early, believed]), np.concatenate([np.full(len(early.t), -1), index])
         judged, rest = take(rows, np.arange(end)), take(rows, np.arange(end, len(rows.t)))
         return Piece(place, believed, over, rest, notes, judged, index)
+
+    def _all_plain(self, rows: Rows) -> NDArray[np.int64] | None:
+        """The indices of all rows where nothing about any of them is odd, as is the rule; else None."""
+        newest = _plain_until(rows.t, rows.sensor, self._newest, self._late)
+        if newest < self._newest:
+            return None
+        fixes = np.flatnonzero(rows.sensor == self._fix)
+        if len(fixes):
+            places = rows.z[fixes, :3]
+            if not np.isfinite(places).all() or ((places[:, 0] == 0) & (places[:, 1] == 0)).any():
+                return None
+            earth = to_earth(places[:, 0], places[:, 1], places[:, 2])
+            assert self._origin is not None
+            if (np.linalg.norm(earth - self._origin, axis=1) > FAR).any():
+                return None
+            self._far = False
+        self._newest = newest
+        return np.arange(len(rows.t))
 
     def _found(self, rows: Rows, notes: list[Note]) -> int:
         """Index of the first fix, or the number of rows."""
@@ -263,6 +285,18 @@ class Arrivals:
             if missing == 0:
                 return True
         return None
+
+
+@compiled
+def _plain_until(t: Times, sensor: NDArray[np.int64], newest: int, late: int) -> int:
+    """The newest time after all rows where none of them is a leap; less than `newest` where one is."""
+    now = newest
+    for i in range(t.size):
+        if t[i] > now + LEAP or (sensor[i] != MARK and t[i] < now - late):
+            return newest - 1
+        if sensor[i] != MARK:
+            now = max(now, t[i])
+    return now
 
 
 def _note(rows: Rows, i: int, text: str) -> Note:

@@ -20,6 +20,22 @@ Message types are compared with the vehicle's clock, each with the lag it had wh
 habitually late ones are neither suspects nor false witnesses. The times of GNSS messages are those of the fix; they
 never bear witness.
 
+Over each link the clock is followed by itself, so a link that is seconds behind another one is neither a step nor a
+reboot. What still comes over it from before a reboot that another link has shown belongs to the boot before.
+
+A frame that tells no time is placed by what came before it. Its sender's timed frames follow each other at intervals D;
+an instant that falls at random among them lies in one in proportion to its length, so since the last reading have
+passed, with E the running means over the last 64 intervals::
+
+    mean age = E[D^2] / (2 E[D])        variance = E[D^3] / (3 E[D]) - (mean age)^2
+
+which is D/2 and D^2/12 where they are equal. After a silence g of receive time that is longer it lies anywhere in it:
+the age is at least g/2 and its standard deviation at least g/sqrt(12), be it that the timed frames were lost, or that
+everything was held up and this one came out first. Before the second reading an interval of 1 s is assumed.
+
+A frame that tells UTC but not the vehicle's time is placed by the last SYSTEM_TIME, which pairs the two; before there
+is one, by the frame that was the least late.
+
 While a suspect waits for its witness the frames from it on are *undecided*: `BootClock.feed` says how many are decided
 and remembers only those. The caller feeds the rest again, with what has come since.
 """
@@ -29,28 +45,32 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from telemetry.boots import (
+    ANCHOR,
+    CLOCK,
+    EPOCH,
+    KINDS,
+    KNOWN,
+    L_SEGMENT,
+    L_SEQ,
+    LINK,
+    LINKS,
+    NEWS,
+    NO_TIME,
+    RESTART,
+    SECOND,
+    SILENCE,
+    STATE,
+    STEP,
+    TURNED,
+    WRAP,
+    feed,
+)
 from telemetry.messages import Counts, Times
 
-NO_TIME = -1  # t_boot of a frame that tells no time
-
-SECOND = 1_000_000_000
-BACK = 1 * SECOND
-AGREE = SECOND // 2  # a witness is back by at least this much
-SLACK = 5 * SECOND
-SILENCE = 10 * SECOND
-HOLD_TIME, HOLD_FRAMES = 2 * SECOND, 512
-SMALL_SEQ, SEQ_JUMP = 32, 32
-SLOW = 1 << 51  # ns, 26 days: a counter with a range beyond this is taken at its word when first seen
-KINDS = 64  # message types told apart; further ones are taken at their word
-
-EPOCH, SEGMENT, ANCHOR, CLOCK, KNOWN, HEARD, SEQ, COUNT, STATE = range(9)
-UNKNOWN, BY_FIX, BY_CLOCK = range(3)  # what CLOCK was read from
-ID, LAG, TURNS, SAID = range(4)  # columns of the table of message types
-WAIT, RESTART, STEP, WRAP, ALONE = range(5)  # verdicts
-NEWS = 64  # events one call of the kernel can report
+__all__ = ["NO_TIME", "BootClock", "Epochs"]
 
 
 class Epochs(NamedTuple):
@@ -66,11 +86,15 @@ class Epochs(NamedTuple):
         Counts reboots and clock steps: inside a segment the vehicle's time is one line.
     t : int64 array
         Vehicle time, ns: the unwrapped boot clock plus the anchor of the epoch, which is t_rx - t_boot of its first
-        timed frame. A frame without a time has that of the clock when it came, and before any clock its receive time.
+        timed frame. A frame without a time has the one that is to be expected (`telemetry.clock`).
+    sigma : int64 array
+        Standard deviation of t, ns; 0 where the frame tells the vehicle's time.
     timed : bool array
         The frame tells the vehicle's clock (and not the time of a fix, an event or nothing).
     restarted : bool array
-        First timed frame after a reboot.
+        First timed frame after a reboot, on each link.
+    stale : bool array
+        The frame is of a boot before this one, over a link that is behind: its time is of that boot.
     events : list of (int, str)
         Index of the frame, and what happened there.
     """
@@ -79,184 +103,11 @@ class Epochs(NamedTuple):
     epoch: Counts
     segment: Counts
     t: Times
+    sigma: Times
     timed: NDArray[np.bool_]
     restarted: NDArray[np.bool_]
+    stale: NDArray[np.bool_]
     events: list[tuple[int, str]]
-
-
-@njit(cache=True, nogil=True)
-def _is_fix(kind):  # type: ignore[no-untyped-def]
-    return kind == 24 or kind == 124 or kind == 33
-
-
-@njit(cache=True, nogil=True)
-def _slot(a, table, kind):  # type: ignore[no-untyped-def]
-    for k in range(a[COUNT]):
-        if table[k, ID] == kind:
-            return k
-    return -1
-
-
-@njit(cache=True, nogil=True)
-def _unwrap(a, table, slot, raw, modulus):  # type: ignore[no-untyped-def]
-    """The reading with the turns known so far; of a type never seen, with those that bring it nearest to the clock."""
-    if modulus <= 0:
-        return raw
-    if slot >= 0:
-        return raw + table[slot, TURNS] * modulus
-    return raw + max(0, (a[CLOCK] - raw + modulus // 2) // modulus) * modulus
-
-
-@njit(cache=True, nogil=True)
-def _wraps(back, modulus, elapsed):  # type: ignore[no-untyped-def]
-    """Whether a reading that is back by so much is explained by a wrap."""
-    return modulus > 0 and 2 * back > modulus and modulus - back <= elapsed + SLACK
-
-
-@njit(cache=True, nogil=True)
-def _can_be_boot(a, raw, elapsed):  # type: ignore[no-untyped-def]
-    return raw <= elapsed + SLACK or 2 * raw < a[CLOCK]
-
-
-@njit(cache=True, nogil=True)
-def _testifies(a, seq, elapsed):  # type: ignore[no-untyped-def]
-    """Whether silence or the sequence number speak for a reboot."""
-    return elapsed >= SILENCE or (seq < SMALL_SEQ and ((seq - a[SEQ]) & 255) >= SEQ_JUMP)
-
-
-@njit(cache=True, nogil=True)
-def _judge(a, table, i, reading, back, t_boot, kind, t_rx, seq, modulus, now, flush):  # type: ignore[no-untyped-def]
-    """Verdict on frame i, whose reading is back by more than `BACK`."""
-    elapsed = t_rx[i] - a[HEARD]
-    falls = modulus[i] > 0 and 2 * back > modulus[i]
-    suspect = -1  # the frame that bears the first witness
-    first = reading
-    if not _is_fix(kind[i]) and not _wraps(back, modulus[i], elapsed):
-        suspect = i
-        if _can_be_boot(a, t_boot[i], elapsed) and _testifies(a, np.int64(seq[i]), elapsed):
-            return RESTART
-    expired = flush or now - t_rx[i] > HOLD_TIME
-    for j in range(i + 1, len(t_boot)):
-        waited = t_rx[j] - t_rx[i]
-        if waited > HOLD_TIME or j - i >= HOLD_FRAMES:
-            expired = True
-            break
-        if t_boot[j] < 0 or _is_fix(kind[j]):
-            continue
-        slot = _slot(a, table, kind[j])
-        if slot < 0 and 0 < modulus[j] < SLOW:
-            continue  # its turns are a guess from the very clock that is in question
-        other = _unwrap(a, table, slot, t_boot[j], modulus[j])
-        if other >= a[CLOCK] - BACK:
-            return WRAP if falls else ALONE
-        behind = a[CLOCK] - (table[slot, LAG] if slot >= 0 else 0) - other
-        if behind <= AGREE or _wraps(behind, modulus[j], elapsed + waited):
-            continue
-        if suspect < 0:
-            if behind > BACK:
-                suspect = j
-                first = other
-                if _can_be_boot(a, t_boot[j], elapsed + waited) and _testifies(a, np.int64(seq[j]), elapsed + waited):
-                    return RESTART
-        elif kind[j] != kind[suspect] and (
-            abs(other - first) <= SLACK + waited or abs(t_boot[j] - t_boot[suspect]) <= SLACK + waited
-        ):
-            return RESTART if _can_be_boot(a, t_boot[suspect], elapsed + t_rx[suspect] - t_rx[i]) else STEP
-    if not expired:
-        return WAIT
-    if falls:
-        return WRAP
-    return ALONE if _is_fix(kind[i]) else STEP
-
-
-@njit(cache=True, nogil=True)
-def _first_turns(i, t_boot, t_rx, modulus, now, flush):  # type: ignore[no-untyped-def]
-    """Turns of the counter that opens the recording, by the first clock that does not wrap so soon; -1: wait."""
-    for j in range(i + 1, len(t_boot)):
-        if t_rx[j] - t_rx[i] > HOLD_TIME or j - i >= HOLD_FRAMES:
-            return 0
-        if t_boot[j] >= 0 and (modulus[j] <= 0 or modulus[j] >= SLOW):
-            return max(0, (t_boot[j] - t_boot[i] + modulus[i] // 2) // modulus[i])
-    return 0 if flush or now - t_rx[i] > HOLD_TIME else -1
-
-
-@njit(cache=True, nogil=True)
-def _feed(a, table, t_boot, kind, t_rx, seq, modulus, begin, now, flush, out, flags, news):  # type: ignore[no-untyped-def]
-    """Decide frames from `begin` on: fill out (k, 3: epoch, segment, t), flags (k, 2: timed, restarted) and news
-    (e, 6: index, verdict, kind, clock before, reading, silence); return (how many are decided, e).
-    """
-    told = 0
-    for i in range(begin, len(t_boot)):
-        raw = t_boot[i]
-        flags[i, 0] = flags[i, 1] = False
-        if raw < 0:
-            out[i, 0], out[i, 1] = a[EPOCH], a[SEGMENT]
-            out[i, 2] = a[CLOCK] + a[ANCHOR] if a[KNOWN] else t_rx[i]
-            continue
-        if told == len(news):
-            return i, told
-        fix = _is_fix(kind[i])
-        elapsed = t_rx[i] - a[HEARD]
-        slot = _slot(a, table, kind[i])
-        if a[KNOWN]:
-            reading = _unwrap(a, table, slot, raw, modulus[i])
-        else:
-            turns = 0
-            if 0 < modulus[i] < SLOW:
-                turns = _first_turns(i, t_boot, t_rx, modulus, now, flush)
-                if turns < 0:
-                    return i, told
-            reading = raw + turns * modulus[i]
-            a[CLOCK] = reading
-            a[ANCHOR] = t_rx[i] - reading
-            a[HEARD] = t_rx[i]
-        back = a[CLOCK] - (table[slot, LAG] if slot >= 0 else 0) - reading
-        tells = not fix
-        if back > BACK:
-            verdict = _judge(a, table, i, reading, back, t_boot, kind, t_rx, seq, modulus, now, flush)
-            if verdict == WAIT:
-                return i, told
-            tells = tells and verdict != ALONE
-            if verdict == RESTART:
-                reading = raw
-            if verdict in (RESTART, STEP) or (verdict == ALONE and not fix and slot >= 0 and table[slot, SAID] == 0):
-                news[told, 0], news[told, 1], news[told, 2] = i, verdict, kind[i]
-                news[told, 3], news[told, 4], news[told, 5] = a[CLOCK], reading, elapsed
-                told += 1
-            if verdict == RESTART:
-                a[EPOCH] += 1
-                a[SEGMENT] += 1
-                a[ANCHOR] = t_rx[i] - raw
-                a[COUNT] = 0
-                a[KNOWN] = UNKNOWN
-                slot = -1
-                flags[i, 1] = True
-            elif verdict == STEP:
-                a[SEGMENT] += 1
-                a[CLOCK] -= back
-            elif verdict == WRAP:
-                reading += modulus[i]
-            elif slot >= 0 and not fix:
-                table[slot, SAID] = 1
-        if a[KNOWN] == UNKNOWN or (not fix and a[KNOWN] == BY_FIX and back <= BACK):
-            a[CLOCK] = reading
-            a[KNOWN] = BY_FIX if fix else BY_CLOCK
-        elif not fix or a[KNOWN] == BY_FIX:
-            a[CLOCK] = max(a[CLOCK], reading)
-        if not fix or a[KNOWN] == BY_FIX:
-            a[HEARD] = t_rx[i]
-            a[SEQ] = seq[i]
-        if slot < 0 and a[COUNT] < KINDS:
-            slot = a[COUNT]
-            a[COUNT] += 1
-            table[slot, ID] = kind[i]
-            table[slot, SAID] = 0
-        if slot >= 0:
-            table[slot, LAG] = a[CLOCK] - reading
-            table[slot, TURNS] = (reading - raw) // modulus[i] if modulus[i] > 0 else 0
-        out[i, 0], out[i, 1], out[i, 2] = a[EPOCH], a[SEGMENT], reading + a[ANCHOR]
-        flags[i, 0] = tells
-    return len(t_boot), told
 
 
 def _plain(values: NDArray[np.generic], dtype: type) -> NDArray[np.generic]:
@@ -284,6 +135,10 @@ class BootClock:
     def __init__(self, vehicle: int) -> None:
         self.vehicle = vehicle
         self._state = np.zeros(STATE, np.int64)
+        self._state[TURNED] = -SILENCE
+        self._links = np.zeros((LINKS, LINK), np.int64)
+        self._links[:, [L_SEGMENT, L_SEQ]] = -1
+        self._rhythm = np.zeros((LINKS, 3))
         self._table = np.zeros((KINDS, 4), np.int64)
         self._news = np.zeros((NEWS, 6), np.int64)
 
@@ -293,7 +148,7 @@ class BootClock:
         return int(self._state[EPOCH])
 
     def place(self, t_rx: int) -> int:
-        """Vehicle time for what happened here at t_rx (ns): the clock as last heard, or t_rx before any clock."""
+        """Newest vehicle time, ns; before any clock t_rx, ns."""
         state = self._state
         return int(state[CLOCK] + state[ANCHOR]) if state[KNOWN] else t_rx
 
@@ -304,6 +159,9 @@ class BootClock:
         t_rx: Times,
         seq: NDArray[np.uint8],
         modulus: Times,
+        link: NDArray[np.uint8] | None = None,
+        copy: NDArray[np.bool_] | None = None,
+        unix: Times | None = None,
         *,
         now: int | None = None,
         flush: bool = False,
@@ -325,29 +183,42 @@ class BootClock:
             Sequence numbers.
         modulus : int64 array, shape (k,)
             Range of the counter behind t_boot, ns; 0 when it never wraps.
+        link : uint8 array, shape (k,), optional
+            Link numbers; all the same if not given.
+        copy : bool array, shape (k,), optional
+            The frame has been fed before, over another link or this one: it shows only how far this link is behind.
+        unix : int64 array, shape (k,), optional
+            UTC that the frame tells, ns; 0 where it tells none.
         now : int, optional
             Receive time that the whole stream has reached, ns: lets a wait end when this vehicle has fallen silent.
         flush : bool
             Decide everything: nothing more will come.
         """
         size = len(t_boot)
-        out, flags = np.empty((size, 3), np.int64), np.empty((size, 2), np.bool_)
+        out, flags = np.empty((4, size), np.int64), np.empty((3, size), np.bool_)
         columns = (
             _plain(t_boot, np.int64),
             _plain(kind, np.int32),
             _plain(t_rx, np.int64),
             _plain(seq, np.uint8),
             _plain(modulus, np.int64),
+            np.zeros(size, np.uint8) if link is None else _plain(link, np.uint8),
+            np.zeros(size, np.bool_) if copy is None else _plain(copy, np.bool_),
+            np.zeros(size, np.int64) if unix is None else _plain(unix, np.int64),
         )
         reached = int(t_rx[-1]) if now is None and size else now or 0
         events: list[tuple[int, str]] = []
+        state = self._state, self._links, self._rhythm, self._table
         decided, told = 0, NEWS
         while told == NEWS:  # the kernel stops when it has no room for more news
-            decided, told = _feed(self._state, self._table, *columns, decided, reached, flush, out, flags, self._news)
-            events += [(row[0], self._text(*row[1:])) for row in self._news[:told].tolist()]
-        epoch, segment, t = np.ascontiguousarray(out[:decided].T)
-        timed, restarted = np.ascontiguousarray(flags[:decided].T)
-        return Epochs(decided, epoch, segment, t, timed, restarted, events)
+            decided, told = feed(*state, *columns, decided, reached, flush, out, flags, self._news)
+            if told:
+                events += [(row[0], self._text(*row[1:])) for row in self._news[:told].tolist()]
+        if decided < size:
+            out, flags = out[:, :decided], flags[:, :decided]
+        epoch, segment, t, sigma = out
+        timed, restarted, stale = flags
+        return Epochs(decided, epoch, segment, t, sigma, timed, restarted, stale, events)
 
     def _text(self, verdict: int, kind: int, before: int, reading: int, silence: int) -> str:
         readings = f"{_seconds(before)} -> {_seconds(reading)} s"
@@ -355,4 +226,6 @@ class BootClock:
             return f"vehicle {self.vehicle} rebooted: boot clock {readings}, {silence / SECOND:.0f} s of silence"
         if verdict == STEP:
             return f"vehicle {self.vehicle}: boot clock stepped back without a reboot: {readings}"
+        if verdict == WRAP:
+            return f"vehicle {self.vehicle}: the counter of message {kind} wrapped, the clock goes on: {readings}"
         return f"vehicle {self.vehicle}: message {kind} alone is behind the boot clock: {readings}"

@@ -19,6 +19,7 @@ an hour is the hull of the hulls of its chunks, so what falls out of the hour ta
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -39,6 +40,7 @@ MIN_SPAN = 60.0  # s
 MAX_RATE = 0.01
 RESOLUTION = 1000.0  # ns, of receive times in common logs: no scatter is taken as smaller
 MOVE = 0.010  # s: a refit that moves time by more is news
+STEPPED = 1.0  # s: when all of the last 30 s came later than the line says by more, the receive clock has stepped
 
 # One int64 vector holds the state.
 # fmt: off
@@ -48,7 +50,7 @@ MOVE = 0.010  # s: a refit that moves time by more is news
 # fmt: on
 ARRIVAL, SYSTEM_TIME = range(2)
 REFERENCES = ("arrival", "system_time")
-OFFSET, OFFSET_SIGMA, RATE, RATE_SIGMA, P50, P99, MAX, SPAN, VALID, MOVED, COLUMNS = range(11)
+OFFSET, OFFSET_SIGMA, RATE, RATE_SIGMA, P50, P99, MAX, SPAN, VALID, MOVED, LATER, COLUMNS = range(12)
 FIELDS = ("offset", "offset_sigma", "rate", "rate_sigma", "delay_p50", "delay_p99", "delay_max", "span")
 LOWER, UPPER, KEPT, STRIDE, SEEN, SIZES = range(6)  # what a chunk holds
 
@@ -132,6 +134,7 @@ def _fit_arrival(a, chunks, sizes, lower, upper, sample, work, values, fit):  # 
     if n >= 2:
         rate = (work[edge + 1, 1] - c0) / (work[edge + 1, 0] - t0)
     minima, used, greatest, kept = 0.0, 0, 0.0, 0
+    last3 = last2 = last1 = 0.0  # least delays of the last three chunks
     for chunk in range(max(now - HOUR + 1, 0), now + 1):
         k = chunk % RING
         if chunks[k] != chunk:
@@ -147,6 +150,7 @@ def _fit_arrival(a, chunks, sizes, lower, upper, sample, work, values, fit):  # 
         if 2 * sizes[k, SEEN] * filled >= points:  # the last chunk, just begun, has no least delay yet
             minima += least**2
             used += 1
+            last3, last2, last1 = last2, last1, least
     values[:kept].sort()
     begin = a[START] - a[ORIGIN]
     span = last - first
@@ -161,6 +165,7 @@ def _fit_arrival(a, chunks, sizes, lower, upper, sample, work, values, fit):  # 
     fit[P50] = values[kept // 2] * 1e-9
     fit[P99] = values[(kept * 99) // 100] * 1e-9
     fit[MAX] = greatest * 1e-9
+    fit[LATER] = min(last3, last2, last1) * 1e-9 if used > 5 else 0.0
     fit[SPAN] = span * 1e-9
 
 
@@ -216,6 +221,7 @@ def _fit_system_time(a, pairs, work, values, fit):  # type: ignore[no-untyped-de
     fit[RATE] = rate
     fit[RATE_SIGMA] = np.sqrt(variance / sxx)
     fit[P50] = fit[P99] = fit[MAX] = np.nan
+    fit[LATER] = 0.0
     fit[SPAN] = (work[n - 1, 0] - work[0, 0]) * 1e-9
     return True
 
@@ -235,6 +241,9 @@ def _emit(a, chunks, sizes, lower, upper, sample, pairs, work, values, before, t
         was = before[reference, 0] + before[reference, 1] * age
         fit[MOVED] = fit[OFFSET] + fit[RATE] * age - was if valid and before[reference, 2] > 0 else 0.0
         before[reference, 0], before[reference, 1], before[reference, 2] = fit[OFFSET], fit[RATE], fit[VALID]
+        if fit[LATER] > STEPPED:  # what came before tells nothing of what will come
+            chunks[:] = -1
+            before[ARRIVAL, 2] = 0.0
         times[k, 0], times[k, 1], times[k, 2] = a[LAST], t_rx, reference
         k += 1
     a[FRESH] = 0
@@ -324,6 +333,8 @@ class ClockFitter:
             np.zeros((2, 3)),
         )
         self._due: list[tuple[int, Times, Floats]] = []
+        self._told = -1  # the boot epoch that `_valid` is about
+        self._valid = [0, 0]  # whether each fit was valid when last told
 
     def feed(self, epochs: Epochs, t_rx: Times, unix: Times) -> None:
         """Take the decided frames of a batch.
@@ -356,7 +367,11 @@ class ClockFitter:
             self._due.append((self._epoch, times[:k], fits[:k]))
 
     def drain(self) -> list[ClockFit | Event]:
-        """Say what is due: the fits, and an event for every refit that moved time by more than 10 ms."""
+        """Say what is due: the fits; and as events what changes about them, at most once per refit.
+
+        A fit becomes valid, or is so no longer; UTC is told by the vehicle itself from now on; a refit moves time by
+        more than 10 ms; the receive clock has stepped forward, and the fit to it begins anew.
+        """
         said: list[ClockFit | Event] = []
         for epoch, times, fits in self._due:
             t, t_rx, reference = np.ascontiguousarray(times.T)
@@ -373,20 +388,35 @@ class ClockFitter:
                     valid=columns[VALID].astype(np.int64),
                 )
             )
-            for k in np.flatnonzero(np.abs(columns[MOVED]) > MOVE).tolist():
-                text = f"vehicle {self.vehicle}: the clock fit to {REFERENCES[reference[k]]} moved time by "
-                said.append(
-                    event(
-                        f"{text}{columns[MOVED][k] * 1e3:+.0f} ms",
-                        vehicle=self.vehicle,
-                        source=self.source,
-                        boot=epoch,
-                        t=int(t[k]),
-                        t_rx=int(t_rx[k]),
-                    )
-                )
+            for k in range(len(t)):
+                for text in self._news(epoch, int(reference[k]), fits[k]):
+                    about: dict[str, Any] = {"vehicle": self.vehicle, "source": self.source, "boot": epoch}
+                    said.append(event(f"vehicle {self.vehicle}: {text}", **about, t=int(t[k]), t_rx=int(t_rx[k])))
         self._due = []
         return said
+
+    def _news(self, epoch: int, reference: int, fit: Floats) -> list[str]:
+        """What a fit changes."""
+        if epoch != self._told:
+            self._told, self._valid = epoch, [0, 0]
+        name, valid, was = REFERENCES[reference], int(fit[VALID]), self._valid[reference]
+        self._valid[reference] = valid
+        news = []
+        if fit[LATER] > STEPPED:
+            news.append(
+                f"the receive clock stepped forward by {fit[LATER]:.1f} s, or the vehicle's stood still: "
+                "the clock fit to arrival begins anew"
+            )
+        if valid and not was:
+            news.append(f"the clock fit to {name} is valid: rate {fit[RATE] * 1e6:+.1f} ppm")
+            if reference == SYSTEM_TIME:
+                news.append("UTC comes from system_time from now on, no longer from arrival")
+        elif was and not valid:
+            why = f"rate {fit[RATE] * 1e6:+.0f} ppm" if abs(fit[RATE]) > MAX_RATE else f"{fit[SPAN]:.0f} s of data"
+            news.append(f"the clock fit to {name} is no longer valid: {why}")
+        if abs(fit[MOVED]) > MOVE:
+            news.append(f"the clock fit to {name} moved time by {fit[MOVED] * 1e3:+.0f} ms")
+        return news
 
     def _take(self, epochs: Epochs, t_rx: Times, unix: Times, begin: int, end: int) -> None:
         state = self._state

@@ -18,8 +18,9 @@ After any failure the scan moves on by one byte, because a good frame may start 
     bytes in = bytes in frames + record headers + discarded + pending
 
 A frame whose id the dialect does not know cannot be checked: it counts as a frame only where framing on both sides
-agrees. A record's time cannot be checked either: a day or more off the record before, it counts only where the record
-after agrees, so that a damaged one dates nothing but a lasting step of the recorder's clock is kept.
+agrees and no good frame lies in it. A record's time cannot be checked either: a day or more off the record before, it
+counts only where the record after agrees, so that a damaged one dates nothing but a lasting step of the recorder's
+clock is kept.
 """
 
 from __future__ import annotations
@@ -29,24 +30,24 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
+from fastcrc.crc16 import mcrf4xx
 from numpy.typing import NDArray
 
-STX1, STX2 = 0xFE, 0xFD
-LONGEST = 280
-HEADER = 8
-JUNK = b"\x00junk"
-JUNK_HEADER = HEADER + len(JUNK) + 2
+from telemetry import framing
+from telemetry.framing import CRC, DAY, HEADER, JUNK, JUNK_HEADER, LATEST, LONGEST, STX1, STX2, Room
+
+__all__ = [
+    "DAY", "HEADER", "JUNK", "JUNK_HEADER", "LATEST", "LONGEST", "LONGEST_JUNK", "STX1", "STX2",
+    "Frames", "StreamScanner", "TlogScanner", "join", "scan_datagrams", "write_junk", "write_record",
+]  # fmt: skip
+
 LONGEST_JUNK = 0xFFFF
-LATEST = 7_258_118_400_000_000  # the year 2200, us: what lies beyond is no time
-DAY = 86_400_000_000  # us
-
-_NOTHING, _GOOD, _UNKNOWN, _CORRUPT, _SHORT = range(5)
+MOST_LINKS = 16
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # a frozen one would take longer to make than a frame to find
 class Frames:
-    """A batch of frames in the order of their arrival, in columns.
+    """A batch of frames in the order of their arrival, in columns, never changed once made.
 
     Attributes
     ----------
@@ -66,6 +67,9 @@ class Frames:
     junk_link : uint8 array, shape (j,)
     junk_corrupt : bool array, shape (j,)
         The run begins like a frame of a known id: a frame whose checksum failed.
+    junk_refused : bool array, shape (j,)
+        The run is one whole frame of a known id with the right checksum: one that was not accepted when it arrived,
+        because of its signature. Such a run is found in our archive only.
     headers : int
         Bytes of record headers.
     pending : int
@@ -89,6 +93,7 @@ class Frames:
     junk_t_rx: NDArray[np.int64]
     junk_link: NDArray[np.uint8]
     junk_corrupt: NDArray[np.bool_]
+    junk_refused: NDArray[np.bool_]
     headers: int = 0
     pending: int = 0
     until: int = 0
@@ -122,6 +127,16 @@ class Frames:
         rows = np.repeat(self.start - start, self.length) + np.arange(self.length.sum())
         return replace(self.select(np.arange(len(self))), data=self.data[rows], start=start)
 
+    def refuse(self, mask: NDArray[np.bool_]) -> Frames:
+        """The same with the frames of `mask` (bool, shape (k,)) among the junk, each a run of its own."""
+        columns: dict[str, Any] = {name: getattr(self, name)[~mask] for name in _PER_FRAME}
+        good = np.zeros(len(mask), np.bool_)
+        runs: tuple[NDArray[Any], ...] = (self.start, self.length, self.t_rx, self.link, good, self.known)
+        order = np.argsort(np.concatenate([self.junk_start, self.start[mask]]), kind="stable")
+        for name, mine in zip(_PER_JUNK, runs, strict=True):
+            columns[name] = np.concatenate([getattr(self, name), mine[mask]])[order]
+        return replace(self, **columns)
+
     def checksum(self) -> NDArray[np.int64]:
         """Checksum bytes of every frame, shape (k,): tells a repeated frame from a different one of the same number."""
         signed = (self.data[self.start] == STX2) & (self.data[np.minimum(self.start + 2, len(self.data) - 1)] & 1 == 1)
@@ -131,7 +146,7 @@ class Frames:
 
 
 _PER_FRAME = ("start", "length", "msgid", "link", "sysid", "compid", "seq", "known", "t_rx")
-_PER_JUNK = ("junk_start", "junk_length", "junk_t_rx", "junk_link", "junk_corrupt")
+_PER_JUNK = ("junk_start", "junk_length", "junk_t_rx", "junk_link", "junk_corrupt", "junk_refused")
 assert [f.name for f in fields(Frames)][1 : 1 + len(_PER_FRAME + _PER_JUNK)] == [*_PER_FRAME, *_PER_JUNK]
 
 
@@ -156,236 +171,63 @@ def join(batches: Sequence[Frames]) -> Frames:
     )
 
 
-def _crc_table() -> NDArray[np.uint16]:
-    table = np.arange(256, dtype=np.uint16)
-    for _ in range(8):
-        table = np.where(table & 1, table >> 1 ^ 0x8408, table >> 1).astype(np.uint16)
-    return table
+_SMALL = 1 << 12
+_WIDE, _NARROW, _FLAGS = np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.bool_)
+_NO_RUNS = (_WIDE, _WIDE, _WIDE, _NARROW, _FLAGS, _FLAGS)
+_NUMBER = [np.array([i]) for i in range(512)]
+_BYTE = [np.array([i], np.uint8) for i in range(256)]
+_KNOWN = np.ones(1, np.bool_)
 
 
-_CRC = _crc_table()  # CRC-16/MCRF4XX: reflected polynomial 0x1021, start 0xFFFF
+def _frames(
+    data: NDArray[np.uint8], room: Room, frames: int, runs: int, headers: int = 0, pending: int = 0, until: int = 0
+) -> Frames:
+    """What was found, in columns of its own length."""
+    wide, narrow, flags = room
+    if len(data) > _SMALL:  # most of the room is empty, and what is found may be kept for long
+        wide, narrow, flags = wide[:, : max(frames, runs)].copy(), narrow[:, : max(frames, runs)].copy(), flags.copy()
+    junk = _NO_RUNS
+    if runs:
+        r = slice(runs)
+        junk = (wide[4, r], wide[5, r], wide[6, r], narrow[4, r], flags[1, r], flags[2, r])
+    f = slice(frames)
+    return Frames(
+        data, wide[0, f], wide[1, f], wide[2, f], narrow[0, f], narrow[1, f], narrow[2, f], narrow[3, f], flags[0, f],
+        wide[3, f], *junk, headers, pending, until,
+    )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
-def _frame_at(data, i, end, extra, table):  # type: ignore[no-untyped-def]
-    """What begins at data[i], given that bytes from `end` on are not ours: (status, length, msgid)."""
-    if i >= end:
-        return _NOTHING, 0, 0
-    stx = data[i]
-    if stx != STX2 and stx != STX1:
-        return _NOTHING, 0, 0
-    head = 10 if stx == STX2 else 6
-    if i + head > end:
-        return _SHORT, 0, 0
-    size = np.int64(data[i + 1])
-    length = head + size + 2
-    if stx == STX2:
-        if data[i + 2] & 0xFE:  # a flag from the future: not to be parsed
-            return _NOTHING, 0, 0
-        if data[i + 2] & 1:
-            length += 13
-        msgid = np.int64(data[i + 7]) | np.int64(data[i + 8]) << 8 | np.int64(data[i + 9]) << 16
+def _one_frame(
+    data: NDArray[np.uint8], t_rx: NDArray[np.int64], link: NDArray[np.uint8], crc_extra: NDArray[np.int16]
+) -> Frames | None:
+    """What `framing.scan_datagrams` says of a datagram that is one good frame of a known id; else None.
+
+    Nearly all live batches of a slow link are such, and calling compiled code and making columns for it would cost
+    several times what the frame does.
+    """
+    raw = data.tobytes()
+    length = len(raw)
+    if length < 8:
+        return None
+    size, flags = raw[1], raw[2]
+    if raw[0] == STX2 and length >= 12 and flags <= 1:
+        body, end = 10 + size, 12 + size + 13 * flags
+        seq, sysid, compid, low, middle, high = raw[4:10]
+        msgid = low | middle << 8 | high << 16
+    elif raw[0] == STX1:
+        body, end = 6 + size, 8 + size
+        seq, sysid, compid, msgid = raw[2:6]
     else:
-        msgid = np.int64(data[i + 5])
-    known = msgid < len(extra) and extra[msgid] >= 0
-    if i + length > end:
-        return _SHORT, length if known else 0, msgid
-    if not known:
-        return _UNKNOWN, length, msgid
-    crc = np.int64(0xFFFF)
-    body = i + head + size
-    for k in range(i + 1, body):
-        crc = crc >> 8 ^ table[(crc ^ data[k]) & 0xFF]
-    crc = crc >> 8 ^ table[(crc ^ extra[msgid]) & 0xFF]
-    if crc == np.int64(data[body]) | np.int64(data[body + 1]) << 8:
-        return _GOOD, length, msgid
-    return _CORRUPT, length, msgid
-
-
-@njit(cache=True, nogil=True)
-def _is_stx(data, i, end):  # type: ignore[no-untyped-def]
-    return i < end and (data[i] == STX2 or data[i] == STX1)
-
-
-@njit(cache=True, nogil=True)
-def _is_corrupt(data, i, end, extra, table):  # type: ignore[no-untyped-def]
-    """Whether a run of no frame, data[i:end], begins like one of a known id: told by its own bytes alone, so that it
-    is the same live and out of the archive.
-    """
-    status, length, _ = _frame_at(data, i, end, extra, table)
-    return status == _CORRUPT or (status == _SHORT and length > 0)
-
-
-@njit(cache=True, nogil=True)
-def _scan_datagrams(data, bounds, extra, table, rows, known, junk, corrupt):  # type: ignore[no-untyped-def]
-    """Fill rows (k,4: start, length, msgid, datagram), known (k,), junk (j,3: start, length, datagram), corrupt
-    (j,).
-    """
-    frames = 0
-    runs = 0
-    for record in range(len(bounds) - 1):
-        i, end = bounds[record], bounds[record + 1]
-        aligned = True
-        while i < end:
-            status, length, msgid = _frame_at(data, i, end, extra, table)
-            if status == _GOOD or (
-                status == _UNKNOWN and aligned and (i + length == end or _is_stx(data, i + length, end))
-            ):
-                rows[frames, 0], rows[frames, 1], rows[frames, 2], rows[frames, 3] = i, length, msgid, record
-                known[frames] = status == _GOOD
-                frames += 1
-                aligned = True
-                i += length
-            else:
-                if aligned:
-                    junk[runs, 0], junk[runs, 1], junk[runs, 2] = i, 0, record
-                    runs += 1
-                aligned = False
-                junk[runs - 1, 1] += 1
-                i += 1
-    for run in range(runs):
-        corrupt[run] = _is_corrupt(data, junk[run, 0], junk[run, 0] + junk[run, 1], extra, table)
-    return frames, runs
-
-
-@njit(cache=True, nogil=True)
-def _time_at(data, i):  # type: ignore[no-untyped-def]
-    t = 0
-    for k in range(8):
-        t = t << 8 | int(data[i + k])
-    return t
-
-
-@njit(cache=True, nogil=True)
-def _record_time(data, i, after, final, last, low):  # type: ignore[no-untyped-def]
-    """Time of the record data[i:after], us: the record before's, `last`, if its own is not to be believed (such
-    records are not counted); -1 if that depends on the record after and it is not here yet. The bits `low` are no
-    time and always its own. The log's first record is believed.
-    """
-    t = _time_at(data, i)
-    if 0 <= t < LATEST:
-        if last <= low or -DAY < t - last < DAY:
-            return t
-        if after + HEADER > len(data):
-            if not final:
-                return -1
-        elif -DAY < _time_at(data, after) - t < DAY:
-            return t
-    return last & ~low | t & low
-
-
-@njit(cache=True, nogil=True)
-def _mark_at(data, i, mark):  # type: ignore[no-untyped-def]
-    """Whether data[i:] begins with the mark: _GOOD or _NOTHING; _SHORT if it ends before that can be told."""
-    for k in range(len(mark)):
-        if i + k >= len(data):
-            return _SHORT
-        if data[i + k] != mark[k]:
-            return _NOTHING
-    return _GOOD
-
-
-@njit(cache=True, nogil=True)
-def _scan_tlog(data, final, aligned, last, low, extra, table, rows, known, junk, corrupt, mark):  # type: ignore[no-untyped-def]
-    """Fill rows (k,4: start, length, msgid, us), junk (j,3: start, length, us); return where it stopped and the
-    account.
-
-    `aligned`: data[0] is where a record should begin; if not, a run of discarded bytes that began in the block before
-    goes on. `last`: time of the record before, us. `low`: bits of a time that are none.
-    """
-    i = 0
-    n = len(data)
-    frames = 0
-    runs = 0
-    headers = 0
-    if not aligned:
-        junk[0, 0], junk[0, 1], junk[0, 2] = 0, 0, last
-        corrupt[0] = False
-        runs = 1
-    while i + HEADER < n:
-        mine = _mark_at(data, i + HEADER, mark) if aligned else _NOTHING
-        if mine != _NOTHING:
-            start = i + JUNK_HEADER
-            after = start
-            if start <= n:
-                after += int(data[start - 2]) | int(data[start - 1]) << 8
-            if after <= n:
-                t = _record_time(data, i, after, final, last, low)
-                if t < 0:
-                    break
-                last = t
-                junk[runs, 0], junk[runs, 1], junk[runs, 2] = start, after - start, last
-                corrupt[runs] = _is_corrupt(data, start, after, extra, table)
-                runs += 1
-                headers += JUNK_HEADER
-                i = after
-                continue
-            if not final:
-                break
-        status, length, msgid = _frame_at(data, i + HEADER, n, extra, table)
-        if status == _SHORT and not final:
-            break
-        after = i + HEADER + length
-        ok = status == _GOOD
-        if status == _UNKNOWN and aligned:
-            next_mark = _mark_at(data, after + HEADER, mark)
-            if next_mark == _SHORT and not final:
-                break
-            ok = after == n or _is_stx(data, after + HEADER, n) or next_mark == _GOOD
-        if ok:
-            t = _record_time(data, i, after, final, last, low)
-            if t < 0:
-                break
-            last = t
-            rows[frames, 0], rows[frames, 1], rows[frames, 2], rows[frames, 3] = i + HEADER, length, msgid, last
-            known[frames] = status == _GOOD
-            frames += 1
-            headers += HEADER
-            i = after
-            aligned = True
-            continue
-        if status == _SHORT and final and aligned and length > 0:
-            break  # the log was cut inside its last frame
-        if aligned:
-            junk[runs, 0], junk[runs, 1], junk[runs, 2] = i, 0, last
-            corrupt[runs] = status == _CORRUPT
-            runs += 1
-        aligned = False
-        junk[runs - 1, 1] += 1
-        i += 1
-    return i, frames, runs, headers, aligned, last
-
-
-def _room(size: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64], NDArray[np.bool_]]:
-    frames = size // 8 + 2  # the shortest frame has 8 bytes
-    return (
-        np.empty((frames, 4), np.int64),
-        np.empty(frames, np.bool_),
-        np.empty((frames, 3), np.int64),
-        np.empty(frames, np.bool_),
-    )
-
-
-def _columns(
-    data: NDArray[np.uint8],
-    rows: NDArray[np.int64],
-    known: NDArray[np.bool_],
-    link: NDArray[np.uint8],
-    t_rx: NDArray[np.int64],
-) -> dict[str, Any]:
-    start = np.ascontiguousarray(rows[:, 0])
-    header = np.where(data[start] == STX2, 4, 2)
-    return {
-        "start": start,
-        "length": rows[:, 1].copy(),
-        "msgid": rows[:, 2].copy(),
-        "link": link,
-        "sysid": data[start + header + 1],
-        "compid": data[start + header + 2],
-        "seq": data[start + header],
-        "known": known.copy(),
-        "t_rx": t_rx,
-    }
+        return None
+    extra = crc_extra.item(msgid) if msgid < len(crc_extra) else -1
+    if end != length or extra < 0:
+        return None
+    if mcrf4xx(raw[1:body] + extra.to_bytes(), 0xFFFF) != raw[body] | raw[body + 1] << 8:
+        return None
+    return Frames(
+        data, _NUMBER[0], _NUMBER[length], _NUMBER[msgid] if msgid < 512 else np.array([msgid]),
+        link, _BYTE[sysid], _BYTE[compid], _BYTE[seq], _KNOWN, t_rx, *_NO_RUNS, until=t_rx.item(),
+    )  # fmt: skip
 
 
 def scan_datagrams(
@@ -410,19 +252,78 @@ def scan_datagrams(
     crc_extra : int16 array
         The dialect's checksum byte per message id, -1 for an unknown id (`telemetry.mavlink.Dialect`).
     """
-    rows, known, junk, corrupt = _room(len(data) + 8 * len(bounds))
-    frames, runs = _scan_datagrams(data, bounds, crc_extra, _CRC, rows, known, junk, corrupt)
-    rows, junk = rows[:frames], junk[:runs]
-    return Frames(
-        data,
-        **_columns(data, rows, known[:frames], link[rows[:, 3]], t_rx[rows[:, 3]]),
-        junk_start=junk[:, 0].copy(),
-        junk_length=junk[:, 1].copy(),
-        junk_t_rx=t_rx[junk[:, 2]],
-        junk_link=link[junk[:, 2]],
-        junk_corrupt=corrupt[:runs].copy(),
-        until=int(t_rx[-1]) if len(t_rx) else 0,
-    )
+    if (
+        len(t_rx) == 1
+        and bounds.item(1) - bounds.item(0) == len(data)
+        and (one := _one_frame(data, t_rx, link, crc_extra))
+    ):
+        return one
+    room = framing.room(len(data) + 8 * len(bounds))
+    frames, runs = framing.scan_datagrams(data, bounds, t_rx, link, crc_extra, CRC, *room)
+    return _frames(data, room, frames, runs, until=t_rx.item(-1) if len(t_rx) else 0)
+
+
+class StreamScanner:
+    """Find the frames in the bytes of one connection (TCP, serial), block by block.
+
+    A frame may be cut anywhere: what may be the beginning of one waits for the rest, and so do discarded bytes
+    before it. Frames and runs are the same however the stream is cut into blocks. To that end a run ends where a frame
+    begins or after 280 bytes, the length of the longest frame, and not where a block does; so at most 559 bytes wait,
+    and a damaged frame is counted as corrupt once.
+
+    Parameters
+    ----------
+    crc_extra : int16 array
+        As in `scan_datagrams`.
+    link : int
+        The connection's link number.
+    """
+
+    def __init__(self, crc_extra: NDArray[np.int16], link: int = 0) -> None:
+        self._extra = crc_extra
+        self._link = link
+        self._rest = b""
+        self._held = 0  # bytes of it that are known to be in no frame
+        self._aligned = True
+
+    @property
+    def pending(self) -> int:
+        """Bytes that wait for the rest of a frame."""
+        return len(self._rest)
+
+    def scan(self, block: bytes, t_rx: int, final: bool = False) -> Frames:
+        """The frames that the next block completes.
+
+        Parameters
+        ----------
+        block : bytes
+        t_rx : int
+            Its receive time, ns, later than those before: that of all that is found now.
+        final : bool
+            The connection has ended: nothing stays pending.
+        """
+        data = np.frombuffer(self._rest + block, np.uint8)
+        room = framing.room(len(data))
+        frames, runs, stop, self._held, self._aligned = framing.scan_stream(
+            data, self._held, self._aligned, final, t_rx, self._link, self._extra, CRC, *room
+        )
+        self._rest = data[stop:].tobytes()
+        return _frames(data, room, frames, runs, pending=len(self._rest), until=t_rx)
+
+
+def link_bits(links: int) -> int:
+    """How many lowest bits of a record's microseconds are the link number, in a raw log of more than one link.
+
+    Receive times are multiples of ``1 << link_bits(links)`` us, with one link too.
+
+    Raises
+    ------
+    ValueError
+        If there are more than 16 links, or none.
+    """
+    if not 0 < links <= MOST_LINKS:
+        raise ValueError(f"{links} links: a raw log tells 1 to {MOST_LINKS} apart")
+    return max(2, (links - 1).bit_length())
 
 
 class TlogScanner:
@@ -433,14 +334,19 @@ class TlogScanner:
     crc_extra : int16 array
         As in `scan_datagrams`.
     links : int
-        1: the time is a time. 2 to 4: its two lowest bits are the link number (only logs that are known to say so); a
-        number beyond the links is damage and counts as link 0.
+        1: the time is a time. More: its `link_bits` lowest bits are the link number (only logs that are known to say
+        so); a number beyond the links is damage and counts as link 0.
+
+    Raises
+    ------
+    ValueError
+        If there are more links than a log tells apart.
     """
 
     def __init__(self, crc_extra: NDArray[np.int16], links: int = 1) -> None:
         self._extra = crc_extra
         self._links = links
-        self._low = 3 if links > 1 else 0
+        self._low = (1 << link_bits(links)) - 1 if links > 1 else 0
         self._rest = np.empty(0, np.uint8)
         self._aligned = True
         self._last: int = 0
@@ -456,29 +362,16 @@ class TlogScanner:
             Nothing will follow: what is pending then is a record cut short.
         """
         data = np.concatenate([self._rest, np.frombuffer(block, np.uint8)])
-        rows, known, junk, corrupt = _room(len(data))
-        stop, frames, runs, headers, self._aligned, self._last = _scan_tlog(
-            data, final, self._aligned, self._last, self._low, self._extra, _CRC, rows, known, junk, corrupt, self._mark
+        room = framing.room(len(data))
+        frames, runs, stop, headers, self._aligned, self._last = framing.scan_tlog(
+            data, final, self._aligned, self._last, self._low, self._extra, CRC, *room, self._mark
         )
         self._rest = data[stop:]
-        rows, junk, corrupt = rows[:frames], junk[:runs], corrupt[:runs]
-        keep = junk[:, 1] > 0
-        junk, corrupt = junk[keep], corrupt[keep]
-        t_rx, link = self._split(rows[:, 3])
-        junk_t_rx, junk_link = self._split(junk[:, 2])
         reached = (self._last & ~self._low) * 1000
-        return Frames(
-            data,
-            **_columns(data, rows, known[:frames], link, t_rx),
-            junk_start=junk[:, 0].copy(),
-            junk_length=junk[:, 1].copy(),
-            junk_t_rx=junk_t_rx,
-            junk_link=junk_link,
-            junk_corrupt=corrupt,
-            headers=int(headers),
-            pending=len(self._rest),
-            until=reached - (not final) if reached else 0,
-        )
+        found = _frames(data, room, frames, runs, headers, len(self._rest), reached - (not final) if reached else 0)
+        t_rx, link = self._split(found.t_rx)
+        junk_t_rx, junk_link = self._split(found.junk_t_rx)
+        return replace(found, t_rx=t_rx, link=link, junk_t_rx=junk_t_rx, junk_link=junk_link)
 
     def _split(self, us: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         link = us & self._low

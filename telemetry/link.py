@@ -16,7 +16,6 @@ from telemetry import loss
 from telemetry.loss import COUNTERS, SECOND, SILENT_ROWS
 from telemetry.messages import Counts, Floats, LinkStats, Times
 
-Flags = NDArray[np.bool_]
 Numbers = NDArray[np.uint8]
 
 
@@ -32,6 +31,8 @@ class Rows(NamedTuple):
     conflict: Counts
     ambiguous: Counts
     restarted: Counts
+    unknown: Counts
+    redundant: Counts
     loss: Floats
     loss_total: Floats
 
@@ -62,6 +63,7 @@ class LossAccount:
         self._past = np.zeros((10, 2), np.int64)
         self._counts: list[Counts] = []
         self._losses: list[Floats] = []
+        self._quiet = loss.NEVER  # receive time up to which nothing is due
 
     @property
     def counters(self) -> dict[str, int]:
@@ -70,7 +72,9 @@ class LossAccount:
         values = self._state[[*range(COUNTERS), loss.SPANNED, loss.OPEN, loss.HELD]]
         return dict(zip(names, values.tolist(), strict=True))
 
-    def feed(self, seq: Numbers, t_rx: Times, digest: Counts, restarted: Flags, continued: Flags | None = None) -> None:
+    def feed(
+        self, seq: Numbers, t_rx: Times, digest: Counts, marks: Numbers | None = None, told: Times | None = None
+    ) -> None:
         """Account for frames in the order of arrival.
 
         Parameters
@@ -80,21 +84,25 @@ class LossAccount:
         t_rx : int64 array, shape (k,)
             Receive times, ns.
         digest : int64 array, shape (k,)
-            Checksum of the frame: a second frame with the same number is a duplicate if it has the same checksum, else
-            a conflict.
-        restarted : bool array, shape (k,)
-            At this frame the sender is known to have begun again, now or a few frames ago.
-        continued : bool array, shape (k,), optional
-            At this frame the sender is known *not* to have begun again: its boot clock goes on. Shortens the wait for
-            a restart after a long silence from 20 s to 5 s.
+            Digest of the frame: a second frame with the same number is a duplicate if it has the same, else a conflict.
+        marks : uint8 array, shape (k,), optional
+            What is known of each frame, bits of `telemetry.loss`: ``BEGUN``, at this frame the sender is known to have
+            begun again, now or a few frames ago; ``CONTINUES``, it is known *not* to have begun again, because its boot
+            clock goes on, which shortens the wait for a restart after a long silence from 20 s to 5 s; ``UNKNOWN_ID``;
+            ``COPY``, another link has brought it before.
+        told : int64 array, shape (k,), optional
+            Vehicle time, ns, where the frame tells it, else 0: tells a silence from a step of the receive clock.
         """
         if len(seq) == 0:
             return
         times = _plain(t_rx, np.int64)
-        since = int(self._state[loss.BOUNDARY]) if self._state[loss.STARTED] else int(times[0])
-        counts, losses = self._room(since, int(times.max()), len(times))
+        state = self._state
+        since, until = (int(state[loss.BOUNDARY]) if state[loss.STARTED] else int(times[0])), int(times[-1])
+        if len(times) > 1:
+            until = max(until, int(times.max()))
+        counts, losses = self._room(since, until, len(times))
         k = loss.feed(
-            self._state,
+            state,
             self._fate,
             self._since,
             self._digests,
@@ -104,8 +112,8 @@ class LossAccount:
             _plain(seq, np.uint8),
             times,
             _plain(digest, np.int64),
-            _plain(restarted, np.bool_),
-            np.zeros(len(times), np.bool_) if continued is None else _plain(continued, np.bool_),
+            np.zeros(len(times), np.uint8) if marks is None else _plain(marks, np.uint8),
+            np.zeros(len(times), np.int64) if told is None else _plain(told, np.int64),
             counts,
             losses,
         )
@@ -113,6 +121,8 @@ class LossAccount:
 
     def advance(self, t_rx: int) -> None:
         """Receive time has reached t_rx (ns): every frame before it has been fed."""
+        if t_rx < self._quiet:
+            return
         state = self._state
         if state[loss.STARTED] and t_rx > state[loss.NOW]:
             counts, losses = self._room(int(state[loss.BOUNDARY]), t_rx, 0)
@@ -130,8 +140,9 @@ class LossAccount:
 
     def rows(self) -> Rows:
         """Drain the rows due so far."""
-        counts = np.concatenate(self._counts) if self._counts else np.empty((0, 1 + COUNTERS), np.int64)
-        losses = np.concatenate(self._losses) if self._losses else np.empty((0, 2))
+        self._counts = self._counts or [np.empty((0, 1 + COUNTERS), np.int64)]
+        self._losses = self._losses or [np.empty((0, 2))]
+        counts, losses = np.concatenate(self._counts), np.concatenate(self._losses)
         self._counts, self._losses = [], []
         return Rows(*np.ascontiguousarray(counts.T), *np.ascontiguousarray(losses.T))
 
@@ -145,6 +156,16 @@ class LossAccount:
         if k:
             self._counts.append(counts[:k])
             self._losses.append(losses[:k])
+        state = self._state
+        due = min(int(state[loss.BOUNDARY]), int(state[loss.EXPIRY]))
+        if state[loss.JUMP] >= 0:
+            due = min(due, int(state[loss.JUMP]) + loss.SETTLE)
+        self._quiet = due
+
+    @property
+    def due(self) -> bool:
+        """Whether there are rows to drain."""
+        return bool(self._counts)
 
 
 class LinkAccounts:
@@ -165,23 +186,23 @@ class LinkAccounts:
         seq: Numbers,
         t_rx: Times,
         digest: Counts,
-        restarted: Flags,
-        continued: Flags | None = None,
+        marks: Numbers | None = None,
+        told: Times | None = None,
     ) -> None:
-        """Account for a batch of frames of any senders in the order of arrival; columns as in `LossAccount`."""
+        """Account for a batch of frames of any senders in the order of arrival; columns as in `LossAccount.feed`."""
         keys = (link.astype(np.int64) << 16) | (sysid.astype(np.int64) << 8) | compid
-        if continued is None:
-            continued = np.zeros(len(keys), np.bool_)
+        marks = np.zeros(len(keys), np.uint8) if marks is None else marks
+        told = np.zeros(len(keys), np.int64) if told is None else told
         present: list[int] = sorted(set(keys.tolist())) if len(keys) < 64 else np.unique(keys).tolist()
         for key in present:
             name = key >> 16, key >> 8 & 255, key & 255
             if name not in self._accounts:
                 self._accounts[name] = LossAccount()
             if len(present) == 1:
-                self._accounts[name].feed(seq, t_rx, digest, restarted, continued)
+                self._accounts[name].feed(seq, t_rx, digest, marks, told)
             else:
                 mine = (keys == key).nonzero()[0]
-                self._accounts[name].feed(seq[mine], t_rx[mine], digest[mine], restarted[mine], continued[mine])
+                self._accounts[name].feed(seq[mine], t_rx[mine], digest[mine], marks[mine], told[mine])
 
     def advance(self, t_rx: int) -> None:
         """Receive time has reached t_rx (ns) on every link: every frame before it has been fed."""
@@ -204,20 +225,8 @@ class LinkAccounts:
             Boot epoch of a system id.
         """
         said = []
-        for (link, sysid, compid), account in sorted(self._accounts.items()):
-            rows = account.rows()
-            if len(rows.t_rx):
-                source = f"{link_names[link]}/{compid}"
-                none = np.zeros(len(rows.t_rx), np.int64)
-                said.append(
-                    LinkStats(
-                        vehicle=sysid,
-                        source=source,
-                        boot=boot(sysid),
-                        t=rows.t_rx,
-                        unknown=none,
-                        redundant=none,
-                        **rows._asdict(),
-                    )
-                )
+        for link, sysid, compid in sorted(name for name, account in self._accounts.items() if account.due):
+            rows = self._accounts[link, sysid, compid].rows()
+            source = f"{link_names[link]}/{compid}"
+            said.append(LinkStats(vehicle=sysid, source=source, boot=boot(sysid), t=rows.t_rx, **rows._asdict()))
         return said

@@ -16,6 +16,9 @@ or it began again at zero. What follows the silence tells which:
 - neither, because only frames without a time arrive (a vehicle that boots sends heartbeats for ten seconds and more
   before its first timed message): decided likewise after 20 s.
 
+The receive clock may have stepped forward instead. Then the vehicle's clock, over the same jump, has gone on by far
+less: what the receive clock is ahead by is no silence.
+
 A long silence is one of more than 2 s, or of more than 128 frame periods (half a turn). A silence followed by the very
 next number was a stall and loses nothing: a lost number of turns would land there once in 256.
 """
@@ -29,20 +32,26 @@ HOLE_SPAN = 64  # and so is one further behind the highest number
 SILENCE = 2 * SECOND
 SETTLE, SETTLE_UNKNOWN = 5 * SECOND, 20 * SECOND
 RATE_WINDOW = 10 * SECOND  # the frame period is that of the last 10..20 s, bursts and stalls included
+STEPPED = 10 * SECOND  # a receive clock ahead of the vehicle's by more has stepped
 SILENT_ROWS = 60 * SECOND  # rows stop this long after the last frame
 RECENT = 100  # steps looked at for consistency
 NEVER = np.iinfo(np.int64).max
 
-# One int64 vector holds the account; its first eight entries are the counters of a row.
+# What is known of a frame, as bits: its sender has begun again, or is known to go on; its id is not in the dialect;
+# another link has brought it before.
+BEGUN, CONTINUES, UNKNOWN_ID, COPY = 1, 2, 4, 8
+
+# One int64 vector holds the account; its first ten entries are the counters of a row.
 # fmt: off
-(RECEIVED, LOST, LATE, DISORDER, DUPLICATE, CONFLICT, AMBIGUOUS, RESTARTED,
+(RECEIVED, LOST, LATE, DISORDER, DUPLICATE, CONFLICT, AMBIGUOUS, RESTARTED, UNKNOWN, REDUNDANT,
  STARTED, NOW, BOUNDARY, SPOKEN,                                  # times: reached, of the next row, of the last frame
  FIRST, HIGHEST, SPANNED, OPEN, EXPIRY,                           # unwrapped numbers; when the oldest hole is given up
  HELD, JUMP, BEFORE, JUMP_NUMBER, JUMP_PROGRESS, JUMP_TIME, JUMP_NUMBERS, TURNING, CONTINUED,  # the held jump
  PROGRESS, OLD_T, OLD_PROGRESS, NEW_T, NEW_PROGRESS, NEW_FRAMES, FRAMES, BEST,                 # the rate
- ODD, STEPS, SIZE) = range(37)
+ TOLD, TOLD_RX, TOLD_BEFORE, TOLD_RX_BEFORE,           # the vehicle's time, last told and last before the jump
+ ODD, STEPS, SIZE) = range(43)
 # fmt: on
-COUNTERS = RESTARTED + 1
+COUNTERS = REDUNDANT + 1
 UNSEEN, ARRIVED, HOLE, GONE, KEPT = range(5)  # the fates; KEPT: in the held jump
 
 
@@ -54,10 +63,17 @@ def _settle(a, fate, turning):  # type: ignore[no-untyped-def]
         rate, after = a[JUMP_NUMBERS] / a[JUMP_TIME], a[SPOKEN] - a[JUMP]
         if after >= SECOND:  # a sender that has slowed down has sent fewer than its old rate says
             rate = min(rate, (a[HIGHEST] - a[JUMP_NUMBER]) / after)
-        expected = (a[SPOKEN] - a[BEFORE]) * rate
+        silence = a[SPOKEN] - a[BEFORE]
+        if a[TOLD_BEFORE] > 0:
+            ahead = a[TOLD_RX] - a[TOLD_RX_BEFORE]
+            gone = max(a[TOLD] - a[TOLD_BEFORE], 0)
+            if ahead - gone > STEPPED and 4 * gone < ahead:
+                silence = max(silence - (ahead - gone), 0)
+        expected = silence * rate
         turns = np.int64(np.floor((expected - (a[PROGRESS] - a[JUMP_PROGRESS])) / 256 + 0.5))
         if turns > 0:
             missing += 256 * turns
+            a[PROGRESS] += 256 * turns
             a[SPANNED] += 256 * turns
         a[AMBIGUOUS] += missing
     a[LOST] += missing
@@ -230,6 +246,8 @@ def _frame(a, fate, since, digests, odd, odd_times, seq, t, digest, restarted): 
         return
     if restarted:
         a[RESTARTED] += 1
+        if a[JUMP] >= 0 and a[CONTINUED]:  # the boot clock has gone on across the jump: it was not this restart
+            _settle(a, fate, a[TURNING] == 1)
         if a[JUMP] < 0:
             _begin(a, fate, digests, seq, t, digest)
             return
@@ -239,11 +257,16 @@ def _frame(a, fate, since, digests, odd, odd_times, seq, t, digest, restarted): 
     same = fate[s] == ARRIVED and digests[s] == digest and step <= 0
     silence = t - a[SPOKEN]
     numbers, time = a[PROGRESS] - a[OLD_PROGRESS], a[SPOKEN] - a[OLD_T]
+    if a[JUMP] >= 0 and float(a[JUMP_NUMBERS]) * time > float(numbers) * a[JUMP_TIME]:
+        numbers, time = a[JUMP_NUMBERS], a[JUMP_TIME]  # the rate since is dulled by the silence
     turning = time >= SECOND and numbers > 0 and float(silence) * numbers > 128.0 * time
+    # After half a turn of silence a number that seems to lie behind is one of a later turn; after a shorter one, if it
+    # has arrived before and now has other bytes.
     repeats = step <= 0 and (fate[s] == ARRIVED or fate[s] == UNSEEN or a[HIGHEST] + step < a[FIRST])
-    jump = not same and step != 1 and ((turning and (step > 1 or repeats)) or (silence > SILENCE and step > 1))
+    turning = turning or (silence > SILENCE and repeats and time >= SECOND and numbers > 0)
+    jump = not same and step != 1 and (turning or (silence > SILENCE and (step > 1 or repeats)))
     if jump and a[JUMP] >= 0:  # of two jumps the longer silence is the one that may be a restart
-        if silence > a[JUMP] - a[BEFORE]:
+        if a[CONTINUED] or silence > a[JUMP] - a[BEFORE]:
             _settle(a, fate, a[TURNING] == 1)
         else:
             jump = False
@@ -252,6 +275,7 @@ def _frame(a, fate, since, digests, odd, odd_times, seq, t, digest, restarted): 
         a[JUMP], a[BEFORE], a[JUMP_PROGRESS] = t, a[SPOKEN], a[PROGRESS]
         a[JUMP_TIME], a[JUMP_NUMBERS] = time, numbers
         a[TURNING], a[CONTINUED] = (1 if turning else 0), 0
+        a[TOLD_BEFORE], a[TOLD_RX_BEFORE] = a[TOLD], a[TOLD_RX]
         _forward(a, fate, since, digests, step if step > 0 else step + 256, t, digest, True)
         a[JUMP_NUMBER] = a[HIGHEST]
     elif step > 0:
@@ -272,7 +296,7 @@ def _frame(a, fate, since, digests, odd, odd_times, seq, t, digest, restarted): 
 
 
 @njit(cache=True, nogil=True)
-def feed(a, fate, since, digests, odd, odd_times, past, seq, t_rx, digest, restarted, continued, counts, losses):  # type: ignore[no-untyped-def]
+def feed(a, fate, since, digests, odd, odd_times, past, seq, t_rx, digest, marks, told, counts, losses):  # type: ignore[no-untyped-def]
     """Account for frames; the rows due on the way go to counts (r, 1 + COUNTERS) and losses (r, 2): how many."""
     k = 0
     for i in range(len(seq)):
@@ -282,9 +306,18 @@ def feed(a, fate, since, digests, odd, odd_times, past, seq, t_rx, digest, resta
             a[BOUNDARY] = (t // SECOND + 1) * SECOND
         t = max(t, a[NOW])
         k = advance(a, fate, since, past, odd_times, t, counts, losses, k)
-        _frame(a, fate, since, digests, odd, odd_times, np.int64(seq[i]), t, digest[i], restarted[i])
-        if continued[i]:
+        begun = marks[i] & BEGUN != 0
+        _frame(a, fate, since, digests, odd, odd_times, np.int64(seq[i]), t, digest[i], begun)
+        if begun:
+            a[TOLD] = a[TOLD_BEFORE] = 0
+        if marks[i] & CONTINUES:
             a[CONTINUED] = 1
+        if marks[i] & UNKNOWN_ID:
+            a[UNKNOWN] += 1
+        if marks[i] & COPY:
+            a[REDUNDANT] += 1
+        if told[i] > 0:
+            a[TOLD], a[TOLD_RX] = told[i], t
         a[SPOKEN] = t
     return k
 

@@ -75,7 +75,7 @@ def say(endpoint: str, action: Action, name: str, vehicle: int = 0) -> str:
     """
     from pymavlink.dialects.v20 import common
 
-    from telemetry.sources.udp import parse_endpoint
+    from telemetry.sources.endpoint import parse_endpoint
 
     text = ground_text(action, name, vehicle)
     there = parse_endpoint(endpoint)

@@ -313,8 +313,8 @@ class ClockFit(Message, frozen=True, kw_only=True, eq=False):
     Parameters
     ----------
     reference : list of str
-        What it was fitted to: "arrival" (this machine's clock, late by the link's least delay) or "system_time" (the
-        vehicle's own UTC).
+        What it was fitted to: "arrival" (this machine's clock, late by the link's least delay), "system_time" (the
+        vehicle's own UTC) or, in on-board logs, "gnss" (UTC of the satellite fixes, late by the receiver's delay).
     offset, offset_sigma : float array, shape (k,)
         s.
     rate, rate_sigma : float array, shape (k,)

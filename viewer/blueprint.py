@@ -124,8 +124,7 @@ def _trajectory(
     tabs.append(_series("NIS", [f"{parent}/live/nis"], axis))
     if more:
         tabs.append(rrb.Grid(*more, name="Other states"))
-    if raw:
-        tabs.append(rrb.Grid(*_sensors(root, raw, axis), name="Sensors"))
+    tabs += _grids(root, raw, axis)
     shares = [4.0, *[3.0] * (len(left) - 2), 2.5] if len(left) > 1 else [1.0]
     right = rrb.Vertical(
         _map(root, extent, entities),
@@ -157,8 +156,7 @@ def _flight_path(root: str, model: str, entities: Collection[str], title: str, *
     documents: list[Any] = _reports(root, model, entities)
     documents.append(rrb.TextDocumentView(name="Window figures", origin=f"{parent}/window/report"))
     documents.append(_series("NIS", [f"{parent}/live/nis"], axis))
-    if raw:
-        documents.append(rrb.Grid(*_sensors(root, raw, axis), name="Sensors"))
+    documents += _grids(root, raw, axis)
     documents.append(_link(root, entities, axis, alone=alone))
     right = rrb.Vertical(
         rrb.Tabs(*[view for view in documents if view is not None], active_tab=0), _events(), row_shares=[4, 1]
@@ -215,6 +213,16 @@ def _series(title: str, paths: list[str], axis: Any, *, legend: bool = True) -> 
     return rrb.TimeSeriesView(name=title, origin="/", contents=paths, plot_legend=box, axis_x=axis)
 
 
+def _grids(root: str, raw: Collection[str], axis: Any) -> list[Any]:
+    """The sensors that are used, and behind them those that are only compared."""
+    used = {path for path in raw if "." not in path.split("/")[3]}
+    return [
+        rrb.Grid(*_sensors(root, those, axis), name=name)
+        for name, those in (("Sensors", used), ("Other sensors", set(raw) - used))
+        if those
+    ]
+
+
 def _sensors(root: str, raw: Collection[str], axis: Any) -> list[Any]:
     return [
         _series(path.removeprefix(f"{root}/raw/").replace("/", ": ").replace("_", " "), [path], axis)
@@ -248,10 +256,16 @@ def _link(root: str, entities: Collection[str], axis: Any, *, alone: bool) -> An
         _series("Loss, 0 to 1", [f"{p}/loss" for p in here], axis),
         _series("Frames: received, lost, late ...", [f"{p}/counters" for p in here], axis),
         _series("Bytes on the link", accounts, axis),
+        _series("Age at the consumers, s", sorted(p for p in entities if _age_of_all(p)), axis),
         _series("Arrival delay, s", [p for p in (f"{root}/clock/delay",) if p in entities], axis),
     ]
     views = [view for view in views if view is not None]
     return rrb.Grid(*views, name="Link") if views else None
+
+
+def _age_of_all(path: str) -> bool:
+    """Whether it is how old things were when a consumer on the bus had them."""
+    return path.startswith("/health/") and path.endswith("/age")
 
 
 def _events() -> Any:

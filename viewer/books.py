@@ -13,6 +13,8 @@ from telemetry.messages import (
     ClockFit,
     Estimate,
     Event,
+    Floats,
+    Health,
     LinkBytes,
     LinkStats,
     Mark,
@@ -29,6 +31,7 @@ from viewer.summary import (
     Boot,
     ByteAccount,
     Clock,
+    Consumer,
     Live,
     Sensor,
     Silence,
@@ -51,9 +54,33 @@ COUNTERS = (
     "unknown",
     "redundant",
 )
+CONSUMED = ("messages", "missing", "backfilled", "refused")
 BYTES = ("bytes", "frames", "unknown", "corrupt", "refused", "discarded", "pending")
 LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 SEVERITIES = ("CRITICAL", "CRITICAL", "CRITICAL", "ERROR", "WARN", "INFO", "INFO", "DEBUG")
+
+
+class Ages:
+    """How old things were, counted in steps of one per cent: constant memory, however many."""
+
+    LEAST, MOST, STEP = 1e-4, 1e7, math.log(1.01)  # s
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(round(math.log(self.MOST / self.LEAST) / self.STEP) + 1, np.int64)
+        self.max = -math.inf
+
+    def add(self, age: float) -> None:
+        """Count one, s."""
+        self.max = max(self.max, age)
+        place = math.log(min(max(age, self.LEAST), self.MOST) / self.LEAST) / self.STEP
+        self._counts[min(round(place), len(self._counts) - 1)] += 1
+
+    def quantile(self, share: float) -> float:
+        """The age that this share of them does not exceed, within half a per cent; NaN for none."""
+        if self.max == -math.inf:
+            return math.nan
+        place = int(np.searchsorted(np.cumsum(self._counts), share * self._counts.sum()))
+        return min(self.LEAST * math.exp(place * self.STEP), self.max)
 
 
 class Books:
@@ -73,7 +100,8 @@ class Books:
         self._clocks: dict[tuple[int, int], Clock] = {}
         self._links: dict[tuple[int, str], Account] = {}
         self._bytes: dict[str, ByteAccount] = {}
-        self._ages: list[float] = []
+        self._ages = Ages()
+        self._consumers: dict[tuple[str, str], Consumer] = {}
 
     def vehicle(self, number: int) -> Vehicle:
         """The books of one vehicle, opened when first asked for."""
@@ -96,7 +124,7 @@ class Books:
             case Estimate():
                 self._estimate(message)
                 if now is not None:
-                    self._ages.append((now - int(t_rx[-1])) / 1e9)
+                    self._ages.add((now - int(t_rx[-1])) / 1e9)
             case Window():
                 whole.windows.append(smoothed(message))
             case Report():
@@ -112,6 +140,8 @@ class Books:
                     self._level("INFO")
             case ClockFit():
                 self._clock(message)
+            case Health():
+                self._health(message)
             case LinkStats():
                 counts = {name: int(getattr(message, name)[-1]) for name in COUNTERS}
                 self._links[message.vehicle, message.source] = Account(
@@ -148,9 +178,9 @@ class Books:
         whole.vehicles = [self._vehicles[number] for number in sorted(self._vehicles)]
         whole.accounts = [self._links[key] for key in sorted(self._links)]
         whole.byte_accounts = [self._bytes[key] for key in sorted(self._bytes)]
-        if self._ages and float(np.median(self._ages)) < 3600.0:  # else the stream was not live
-            p50, p99 = np.percentile(self._ages, [50, 99])
-            whole.age = Age(p50=float(p50), p99=float(p99), max=max(self._ages))
+        whole.consumers = [self._consumers[key] for key in sorted(self._consumers)]
+        if self._ages.quantile(0.5) < 3600.0:  # else the stream was not live
+            whole.age = Age(p50=self._ages.quantile(0.5), p99=self._ages.quantile(0.99), max=self._ages.max)
         return whole
 
     def _level(self, level: str) -> None:
@@ -192,6 +222,14 @@ class Books:
             known.t0, known.t1 = min(known.t0, t[0]), max(known.t1, t[1])
             known.t_rx0, known.t_rx1 = min(known.t_rx0, t_rx[0]), max(known.t_rx1, t_rx[1])
 
+    def _health(self, message: Health) -> None:
+        key = message.source, message.stage
+        counts = {name: int(getattr(message, name)[-1]) for name in CONSUMED}
+        was = self._consumers.get(key)
+        p99 = _most(message.age_p99, was.age_p99 if was else None)
+        most = _most(message.age_max, was.age_max if was else None)
+        self._consumers[key] = Consumer(consumer=key[0], stage=key[1], age_p99=p99, age_max=most, **counts)
+
     def _clock(self, message: ClockFit) -> None:
         self.vehicle(message.vehicle)
         fields = ("offset", "offset_sigma", "rate", "rate_sigma", "delay_p50", "delay_p99", "delay_max", "span")
@@ -199,3 +237,9 @@ class Books:
         self._clocks[message.vehicle, message.boot] = Clock(
             boot=message.boot, reference=message.reference[-1], valid=bool(message.valid[-1]), **numbers
         )
+
+
+def _most(values: Floats, before: float | None) -> float | None:
+    """The largest of the finite values and the one before; None for none."""
+    known = [*values[np.isfinite(values)].tolist(), *([] if before is None else [before])]
+    return max(known, default=None)

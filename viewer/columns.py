@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -53,6 +54,7 @@ class Belief(NamedTuple):
     unit: str
 
 
+@lru_cache(maxsize=4096)
 def slug(name: str) -> str:
     """Entity path part of a name: letters, digits, ``_``, ``-``, ``.``; anything else becomes ``_``."""
     return re.sub(r"[^A-Za-z0-9_.\-]+", "_", name).strip("_") or "_"
@@ -228,6 +230,9 @@ def joined(messages: Sequence[Message], field: str) -> NDArray[Any]:
     return getattr(messages[0], field) if len(messages) == 1 else np.concatenate([getattr(m, field) for m in messages])
 
 
+_NOWHERE, _NEVER = np.empty(0, np.intp), np.empty(0, np.int64)
+
+
 class Seam:
     """Where a line must not be joined: across a silence, and between boot epochs.
 
@@ -250,6 +255,9 @@ class Seam:
 
     def find(self, boot: int, t: Times, t_rx: Times) -> tuple[NDArray[np.intp], Times, Times]:
         """Rows before which a break belongs, and the times of the breaks; remembers the rows as seen."""
+        if self.high is not None and boot == self.boot and (newest := int(t.max())) - self.high <= self.gap:
+            self.high, self.t_rx = max(self.high, newest), int(t_rx[-1])
+            return _NOWHERE, _NEVER, _NEVER  # as a rule; the same as below comes to
         before = np.concatenate([[t[0] if self.high is None else self.high], t])[:-1]
         if self.high is not None and boot != self.boot:
             before[0] = t[0]  # a new epoch starts afresh: its clock may have stepped back

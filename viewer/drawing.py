@@ -111,7 +111,7 @@ class Drawing:
         for name in parts[0]:
             column = np.concatenate([part[name] for part in parts])
             entity = f"{group.parent}/{name}"
-            self._style(self.main, entity, style.sensor(run[0].stream, name))
+            self._style(self.main, entity, style.sensor, run[0].stream, name)
             self.main.scalars(entity, t_broken, rx_broken, broken(column, at))
         self._track(self.main, group, run, t, t_rx, at)
 
@@ -122,7 +122,7 @@ class Drawing:
         t_broken, rx_broken = broken_times(t, at, times), broken_times(t_rx, at, receive)
         self._beliefs(self.main, run, t_broken, rx_broken, at, None)
         nis = np.column_stack([joined(run, "nis"), joined(run, "dof").astype(np.float64)])
-        self._style(self.main, f"{group.parent}/nis", style.nis())
+        self._style(self.main, f"{group.parent}/nis", style.nis)
         self.main.scalars(f"{group.parent}/nis", t_broken, rx_broken, broken(nis, at))
         self._track(self.main, group, run, t, t_rx, at)
 
@@ -194,7 +194,7 @@ class Drawing:
             beliefs = [part[entity] for part in parts]
             values = broken(np.concatenate([b.values for b in beliefs]), at)
             variances = broken(np.concatenate([b.variances for b in beliefs]), at)
-            self._style(sink, entity, style.belief(entity, name, beliefs[0].unit))
+            self._style(sink, entity, style.belief, entity, name, beliefs[0].unit)
             sink.measurements(entity, t, t_rx, values, variances, window)
         entity = f"{estimate_path(run[0])}/geodetic"
         points = broken(joined(run, "geodetic"), at)
@@ -204,7 +204,7 @@ class Drawing:
                 return
             self._placed.add(entity)
             t, t_rx, points = t[known[0] :], t_rx[known[0] :], points[known[0] :]
-        self._style(sink, entity, style.geodetic())
+        self._style(sink, entity, style.geodetic)
         sink.scalars(entity, t, t_rx, points, window)
 
     def clock(self, group: Group, messages: list[Message]) -> None:
@@ -212,7 +212,7 @@ class Drawing:
         t, t_rx = joined(messages, "t"), joined(messages, "t_rx")
         for name, unit in (("offset", "s"), ("rate", "1")):
             entity = f"{group.parent}/{name}"
-            self._style(self.main, entity, style.belief(entity, f"clock {name}", unit))
+            self._style(self.main, entity, style.belief, entity, f"clock {name}", unit)
             self.main.measurements(
                 entity, t, t_rx, joined(messages, name), np.square(joined(messages, f"{name}_sigma"))
             )
@@ -223,7 +223,7 @@ class Drawing:
         t, t_rx = joined(messages, "t"), joined(messages, "t_rx")
         for name, fields in entities.items():
             entity = f"{group.parent}/{name}" if name else group.parent
-            self._style(self.main, entity, style.names(fields))
+            self._style(self.main, entity, style.names, fields)
             self.main.scalars(
                 entity, t, t_rx, np.column_stack([joined(messages, field).astype(np.float64) for field in fields])
             )
@@ -267,7 +267,7 @@ class Drawing:
             known = np.isfinite(points).all(axis=1)
             if known.any():
                 entity = f"{vehicle_path(run[0].vehicle)}/world/body{_branch(run[0].model)}"
-                self._style(sink, entity, style.body(run[0].vehicle))
+                self._style(sink, entity, style.body, run[0].vehicle)
                 here = local_metres(points[known], self.origin)
                 sink.points(entity, t[known], t_rx[known], [row[None] for row in here])
 
@@ -285,7 +285,7 @@ class Drawing:
         self._see(root[1:], np.concatenate(metres))
         for view, rows in (("world", metres), ("geo", angles)):
             entity = f"{root}/{view}/{kind}{branch}"
-            self._style(sink, entity, style.track(view, kind))
+            self._style(sink, entity, style.track, view, kind)
             write = {
                 ("world", True): sink.lines,
                 ("world", False): sink.points,
@@ -330,10 +330,10 @@ class Drawing:
                     self.main.state(entity, int(t[0]), int(t_rx[0]), f"boot {boot}")
         self._heard.clear()
 
-    def _style(self, sink: Sink, entity: str, what: Any) -> None:
+    def _style(self, sink: Sink, entity: str, what: Callable[..., Any], *arguments: Any) -> None:
         if (id(sink), entity) not in self._styled:
             self._styled.add((id(sink), entity))
-            sink.static(entity, what)
+            sink.static(entity, what(*arguments))
 
 
 def _branch(model: str) -> str:

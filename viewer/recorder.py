@@ -17,18 +17,19 @@ from telemetry.messages import (
     ClockFit,
     Estimate,
     Event,
-    Gnss,
+    Health,
     LinkBytes,
     LinkStats,
     Mark,
     Message,
     Progress,
     Report,
+    Sample,
     StatusText,
     Window,
 )
 from viewer.blueprint import layout
-from viewer.books import BYTES, COUNTERS, Books
+from viewer.books import BYTES, CONSUMED, COUNTERS, Books
 from viewer.columns import GAP, TRAJECTORY, Seam, estimate_path, runs, slug, vehicle_path
 from viewer.drawing import Drawing, Group
 from viewer.sink import Sink, claim
@@ -48,6 +49,7 @@ def record(
     properties: Mapping[str, str] | None = None,
     interval: float | None = 0.1,
     on_alarm: Callable[[str], None] | None = None,
+    index: bool = True,
 ) -> Summary:
     """Write a stream of messages into a recording.
 
@@ -69,6 +71,9 @@ def record(
         Receive time after which what waits is written, s; None offline, where only full chunks are.
     on_alarm : callable, optional
         Told when writing fails or works again. Recording goes on.
+    index : bool
+        Whether the files end with a list of what is in them, as `Sink`. Without, the memory of a long recording stays
+        flat, but ``rerun rrd verify`` and readers that jump want one.
 
     Returns
     -------
@@ -83,7 +88,7 @@ def record(
         If a file cannot be created.
     """
     recorder = Recorder(
-        path, windows=windows, sortie=sortie, properties=properties, interval=interval, on_alarm=on_alarm
+        path, windows=windows, sortie=sortie, properties=properties, interval=interval, on_alarm=on_alarm, index=index
     )
     try:
         for message in messages:
@@ -116,6 +121,7 @@ class Recorder:
         on_alarm: Callable[[str], None] | None = None,
         gap: float = GAP,
         serve: int | None = None,
+        index: bool = True,
     ) -> None:
         self._interval = math.inf if interval is None else interval * 1e9
         self._live = interval is not None
@@ -130,7 +136,7 @@ class Recorder:
             except OSError:
                 path.unlink()  # just created, empty
                 raise
-        self._main = Sink(path, sortie, self._alarm, serve=serve)
+        self._main = Sink(path, sortie, self._alarm, serve=serve, index=index)
         self._layer = self._main if windows is None else Sink(Path(windows), sortie, self._alarm, join=serve)
         self._books = Books(sortie, gap)
         self._books.summary.properties = dict(properties or {})
@@ -139,7 +145,7 @@ class Recorder:
         )
         self._drawing = Drawing(self._main, self._layer, gap, self._books.silent)
         self._groups: dict[tuple[Any, ...], Group] = {}
-        self._components: dict[tuple[int, str], dict[str, str]] = {}
+        self._components: dict[tuple[int, str], dict[tuple[str, bool], str]] = {}
         self._drawn: frozenset[str] = frozenset()
         self._written_rx: int | None = None
         self._slow_rx = 0
@@ -235,21 +241,27 @@ class Recorder:
                 key, parent = ("bytes", message.source), f"/link/{slug(message.source)}/bytes"
             case ClockFit():
                 key, parent = ("clock", message.vehicle), f"{root}/clock"
+            case Health():
+                parent = f"/health/{slug(message.source)}/{slug(message.stage)}"
+                key = ("health", parent)
             case Estimate():
                 parent, track = estimate_path(message), Track(joins=True)
                 key = ("live", parent)
             case _:
                 component = message.source.partition("/")[2] or message.source
+                chosen = not isinstance(message, Sample) or message.chosen
                 names = self._components.setdefault((message.vehicle, message.stream), {})
-                # The first component has the plain name; a second receiver stands beside it, not among its rows.
+                # The first component that is used has the plain name; a second receiver stands beside it, not among its
+                # rows, and so do those that are only compared.
+                plain = chosen and message.stream not in names.values()
                 name = names.setdefault(
-                    component, message.stream if not names else f"{message.stream}.{slug(component)}"
+                    (component, chosen), message.stream if plain else f"{message.stream}.{slug(component)}"
                 )
                 key, parent = (message.vehicle, name), f"{root}/raw/{name}"
-                if message.stream == "gnss":
+                if message.stream == "gnss" and chosen:
                     track = Track(joins=False)
         if key not in self._groups:
-            quick = isinstance(message, (Gnss, Event, StatusText, Mark))
+            quick = isinstance(message, (Event, StatusText, Mark))
             quick |= isinstance(message, Estimate) and message.model == TRAJECTORY  # others have many states
             self._groups[key] = Group(parent, [], Seam(self._gap), track, [0], quick)
         return self._groups[key]
@@ -272,6 +284,9 @@ class Recorder:
                 self._drawing.plain(group, messages, {"": BYTES})
             case ClockFit():
                 self._drawing.clock(group, messages)
+            case Health():
+                ages = ("age_p50", "age_p99", "age_max")
+                self._drawing.plain(group, messages, {"age": ages, "counters": CONSUMED})
             case Estimate():
                 for run in runs(messages):
                     self._drawing.estimates(group, run)

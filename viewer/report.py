@@ -200,6 +200,16 @@ def _links(summary: Summary, console: Console) -> None:
             counts = (b.bytes, b.frames, b.unknown, b.corrupt, b.refused, b.discarded, b.pending)
             table.add_row(_plain(b.source), *map(str, counts))
         console.print(table)
+    if summary.consumers:
+        table = _table(
+            "Consumers on the bus", "consumer", "listens to", "worst p99 age>", "max age>", "messages>", "missing>",
+            "backfilled>", "refused>",
+        )  # fmt: skip
+        for c in summary.consumers:
+            ages = ("-" if age is None else f"{age:.3f} s" for age in (c.age_p99, c.age_max))
+            figures = map(str, (c.messages, c.missing, c.backfilled, c.refused))
+            table.add_row(_plain(c.consumer), _plain(c.stage), *ages, *figures)
+        console.print(table)
     if summary.age is not None:
         console.print(
             f"  age of live estimates when recorded: p50 {summary.age.p50:.3f}, p99 {summary.age.p99:.3f}, "

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from telemetry.messages import Times
-from viewer.books import BYTES, COUNTERS
+from viewer.books import BYTES, CONSUMED, COUNTERS
 from viewer.columns import first, place
 from viewer.comparison import Difference, compare
 from viewer.reading import Reading, column
@@ -18,6 +18,7 @@ from viewer.summary import (
     Boot,
     ByteAccount,
     Clock,
+    Consumer,
     Live,
     Sensor,
     Silence,
@@ -124,6 +125,8 @@ def _rebuilt(reading: Reading, log: list[Line]) -> Summary:
         parts = entity.split("/")[1:]
         if parts[0] == "link":
             _account(reading, entity, summary)
+        if parts[0] == "health" and parts[-1] == "counters":
+            _consumer(reading, entity, summary)
         if not (parts[0].startswith("v") and parts[0][1:].isdigit()):
             continue
         number = int(parts[0][1:])
@@ -249,6 +252,16 @@ def _clock(reading: Reading, entity: str, vehicle: Vehicle) -> None:
                 **found,
             )
         )
+
+
+def _consumer(reading: Reading, entity: str, summary: Summary) -> None:
+    _, rows = reading.column(entity, "Scalars:scalars")
+    _, ages = reading.column(entity.removesuffix("counters") + "age", "Scalars:scalars")
+    if len(rows):
+        parts = entity.split("/")
+        p99, most = (finite(np.nanmax(ages[:, i], initial=-np.inf)) for i in (1, 2)) if len(ages) else (None, None)
+        last = dict(zip(CONSUMED, [int(x) for x in rows[-1]], strict=True))
+        summary.consumers.append(Consumer(consumer=parts[2], stage=parts[3], age_p99=p99, age_max=most, **last))
 
 
 def _account(reading: Reading, entity: str, summary: Summary) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
@@ -51,6 +52,42 @@ def stamps(t: Times, t_rx: Times, window: int | None = None) -> list[rr.TimeColu
     return columns
 
 
+class Column(NamedTuple):
+    """A component's rows, as they are sent."""
+
+    descriptor: Any
+    rows: pa.Array
+
+    def component_descriptor(self) -> Any:
+        """Which component it is."""
+        return self.descriptor
+
+    def as_arrow_array(self) -> pa.Array:
+        """One list for each row."""
+        return self.rows
+
+
+def numbers(descriptors: tuple[Any, ...], *values: Floats) -> list[Column]:
+    """Columns of plain numbers, (k,) or (k, m) each: what the archetypes' own `columns` make, at a tenth of the cost,
+    which matters when every entity has some a second.
+    """
+    columns = []
+    for descriptor, value in zip(descriptors, values, strict=True):
+        flat = np.ascontiguousarray(value, np.float64)
+        width = 1 if flat.ndim == 1 else flat.shape[1]
+        offsets = np.arange(0, flat.size + 1, width, dtype=np.int32)
+        columns.append(Column(descriptor, pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat.ravel()))))
+    return columns
+
+
+def _descriptors(columns: Iterable[Any]) -> tuple[Any, ...]:
+    return tuple(column.component_descriptor() for column in columns)
+
+
+_SCALARS = _descriptors(rr.Scalars.columns(scalars=[0.0]))
+_MEASUREMENTS = _descriptors(rr.Measurements.columns(values=[0.0], variances=[0.0]))
+
+
 class Sink:
     """A recording that is being written.
 
@@ -66,6 +103,9 @@ class Sink:
         Port on 127.0.0.1 at which viewers may look on; None for none.
     join : int, optional
         Port on 127.0.0.1 of another sink of this sortie whose viewers shall see this layer too.
+    index : bool
+        Whether the file ends with a list of everything in it. It is kept in memory until then, and grows by two
+        kilobytes with every chunk; readers do without.
     """
 
     def __init__(
@@ -76,32 +116,35 @@ class Sink:
         *,
         serve: int | None = None,
         join: int | None = None,
+        index: bool = True,
     ) -> None:
         self.path = path
         self.entities: set[str] = set()
         self.failing = False
         self._on_alarm = on_alarm
+        self._stamped: tuple[Any, Any, int | None, list[rr.TimeColumn]] | None = None  # times, and their columns
         self._stream = rr.RecordingStream(APPLICATION, recording_id=sortie, send_properties=False)
         # A clock of this machine in every row would make equal flights into different recordings.
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
+        file = rr.FileSink(str(path), write_footer=index)
         if serve is not None:
-            self._stream.set_sinks(rr.FileSink(str(path)), rr.GrpcServerSink(bind_ip="127.0.0.1", port=serve))
+            self._stream.set_sinks(file, rr.GrpcServerSink(bind_ip="127.0.0.1", port=serve))
         elif join is not None:
-            self._stream.set_sinks(rr.FileSink(str(path)), rr.GrpcSink(f"rerun+http://127.0.0.1:{join}/proxy"))
+            self._stream.set_sinks(file, rr.GrpcSink(f"rerun+http://127.0.0.1:{join}/proxy"))
         else:
-            self._stream.save(path)
+            self._stream.set_sinks(file)
         self._stream.send_recording_name(sortie)
 
     def scalars(self, entity: str, t: Times, t_rx: Times, values: Floats, window: int | None = None) -> None:
         """Rows of one or several plain numbers; values of shape (k,) or (k, m)."""
-        self._columns(entity, stamps(t, t_rx, window), rr.Scalars.columns(scalars=values))
+        self._columns(entity, self._stamps(t, t_rx, window), numbers(_SCALARS, values))
 
     def measurements(
         self, entity: str, t: Times, t_rx: Times, values: Floats, variances: Floats, window: int | None = None
     ) -> None:
         """Rows of a number with its variance."""
-        self._columns(entity, stamps(t, t_rx, window), rr.Measurements.columns(values=values, variances=variances))
+        self._columns(entity, self._stamps(t, t_rx, window), numbers(_MEASUREMENTS, values, variances))
 
     def points(self, entity: str, t: Times, t_rx: Times, positions: list[Floats]) -> None:
         """Rows of points in local metres, east-north-up."""
@@ -181,6 +224,13 @@ class Sink:
         done = self.flush()
         self._stream.disconnect()
         return done
+
+    def _stamps(self, t: Times, t_rx: Times, window: int | None) -> list[rr.TimeColumn]:
+        """As `stamps`; the states of an estimate have the same times, so the columns are made once for all."""
+        last = self._stamped
+        if last is None or last[0] is not t or last[1] is not t_rx or last[2] != window:
+            last = self._stamped = (t, t_rx, window, stamps(t, t_rx, window))
+        return last[3]
 
     def _columns(self, entity: str, times: Iterable[rr.TimeColumn], columns: Any) -> None:
         self._stream.send_columns(entity, times, columns)

@@ -186,6 +186,30 @@ class Age(msgspec.Struct, kw_only=True):
     max: float
 
 
+class Consumer(msgspec.Struct, kw_only=True):
+    """How a consumer on the bus kept up with a stage.
+
+    Parameters
+    ----------
+    consumer, stage : str
+        Who listened to whom.
+    age_p99, age_max : float or None
+        The largest 99th percentile of any second, and the largest age: from the receive time of a message's newest
+        sample to the moment it was handed on, s.
+    messages, missing, backfilled, refused : int
+        As in `telemetry.messages.Health`, at the end.
+    """
+
+    consumer: str
+    stage: str
+    age_p99: float | None
+    age_max: float | None
+    messages: int
+    missing: int
+    backfilled: int
+    refused: int
+
+
 class Summary(msgspec.Struct, kw_only=True):
     """What a recording holds.
 
@@ -218,6 +242,7 @@ class Summary(msgspec.Struct, kw_only=True):
     vehicles: list[Vehicle] = []
     accounts: list[Account] = []
     byte_accounts: list[ByteAccount] = []
+    consumers: list[Consumer] = []
     windows: list[Smoothed] = []
     reports: list[Worth] = []
     events: dict[str, int] = {}

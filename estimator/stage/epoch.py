@@ -15,10 +15,11 @@ from estimator.stage.settings import STAGE, Level, Reason, Scope, Settings
 from estimator.stage.sieve import Sieve
 from estimator.stage.trajectory import Leg
 from estimator.stretch import Stretch
-from estimator.synchronise import MARK, Rows, concatenate, take
-from telemetry.messages import Event, Mark, Message, event
+from estimator.synchronise import MARK, NEVER, Rows, concatenate, take
+from telemetry.messages import Altitude, Event, Gnss, Mark, Message, event
 
 TAKEN = (*KINDS, Mark)
+SLOW = (Gnss, Altitude)  # what the trajectory is made of
 
 
 class Epoch:
@@ -27,7 +28,7 @@ class Epoch:
     def __init__(self, vehicle: int, boot: int, settings: Settings, scope: Scope) -> None:
         self.heard = np.iinfo(np.int64).max  # receive time of the first message
         self.vehicle, self.boot, self.settings, self.scope = vehicle, boot, settings, scope
-        self._lag = round(settings.lag * 1e9)
+        self._lag, self._output = round(settings.lag * 1e9), round(settings.output * 1e9)
         self._arrivals = Arrivals(SENSORS, GNSS, lag=self._lag, witnesses=WITNESSES)
         self._sieve = Sieve()
         self.marks: list[tuple[str, str]] = []  # action and name
@@ -39,23 +40,53 @@ class Epoch:
         self._begun = False
         self.begun: Callable[[Stretch], object] | None = None  # told of every flight path that begins
         self._samples, self._t, self._t_rx = 0, np.iinfo(np.int64).min, np.iinfo(np.int64).min
+        self._waits = NEVER  # least time of what the trajectory has not used yet
+        self._worked = -NEVER  # receive time up to which everything has been worked on
+        self._new = False  # something has come since
+        self._told = False  # a mark has
 
     def take(self, message: Message) -> None:
         """Take a message in; nothing happens before its receive time has been covered."""
         self.heard = min(self.heard, int(message.t_rx.min()))
         self._samples += len(message.t)
         self._t, self._t_rx = max(self._t, int(message.t.max())), max(self._t_rx, int(message.t_rx.max()))
+        self._new = True
         if isinstance(message, Mark):
+            self._told = True
             k = len(message.t)
             z = np.full((k, WIDTH), np.nan)
             z[:, 0] = len(self.marks) + np.arange(k)
             self.marks += zip(message.action, message.name, strict=True)
             self._arrivals.push(Rows(message.t, message.t_rx, np.full(k, MARK), z, np.ones((k, WIDTH))))
         else:
+            if isinstance(message, SLOW):
+                self._waits = min(self._waits, int(message.t.min()))
             self._arrivals.push(rows(message))
+
+    def _due(self, until: int) -> bool:
+        """Whether an estimate may be told now: what comes in between is worked on with it, which is so much cheaper.
+
+        Results do not depend on it, as they do not depend on how the input was cut.
+        """
+        if not self._new:
+            return False
+        if self._told or self._leg is None or until - self._worked >= self._output:
+            return True
+        if self._t - self._leg.lag >= self._waits:
+            return True
+        if self._flight is None or self._flight.at is None:
+            return False
+        return (self._t - self._flight.lag) // self._output > self._flight.at[0] // self._output
 
     def advance(self, until: int, end: Reason | None = None) -> Iterator[Message]:
         """Filter what is complete, and tell the windows that close on the way."""
+        if end is None and not self._due(until):
+            return
+        yield from self._work(until, end)
+        self._waits = NEVER if self._leg is None else self._leg.oldest
+        self._worked, self._new, self._told = until, False, False
+
+    def _work(self, until: int, end: Reason | None) -> Iterator[Message]:
         arrived = self._arrivals.covered(until)
         if arrived is not None:
             arrived, refusals = self._sieve.sift(arrived)
@@ -82,7 +113,7 @@ class Epoch:
                     if piece.over:
                         yield from self._leg.finish("gap", until)
                 except (ValueError, ArithmeticError) as error:
-                    failed = piece.row(self._leg.at + self._lag)
+                    failed = piece.row(self._leg.watermark, self._leg.at)
                     yield from self._fly(take(piece.rows, piece.places <= failed), until)
                     yield from self._fail(self._leg, error)
                     arrived = concatenate([take(piece.judged, np.arange(failed + 1, len(piece.judged.t))), arrived])

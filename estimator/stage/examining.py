@@ -12,7 +12,7 @@ from estimator.kinematics import ATTITUDE as ANGLES
 from estimator.kinematics import Earth
 from estimator.models.flight_path import Settings
 from estimator.stage.rows import AIR, ALTITUDE, ATTITUDE, FIX_VELOCITY, FLOW, GNSS, HEIGHT_COLUMN, INERTIAL, SENSORS
-from estimator.synchronise import Rows
+from estimator.synchronise import Rows, concatenate
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -26,6 +26,7 @@ KEPT = {
     FLOW: (MEASURED + 1, MEASURED + 2),
 }
 EVER = 1 << 62  # ns
+UNSORTED = 1000  # rows that may wait to be sorted by sensor
 HOLE = 1.75  # usual intervals between two samples: from there on one is missing, and not only late
 QUIET = 5.0  # s: a longer silence of a sensor is told
 CERTAIN = 5.0  # sigmas at which a delay that was found is taken off
@@ -52,12 +53,25 @@ class Examiner:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._kept: dict[int, list[tuple[Times, Times, Floats]]] = {sensor: [] for sensor in KEPT}
+        self._unsorted: list[tuple[Rows, Times]] = []
+        self._count = 0  # of these
 
     def take(self, samples: Rows, passed: Times) -> None:
         """Keep samples, in order of their arrival.
 
         ``passed`` (k,): time that had been passed, and would not be waited for, when each of them arrived.
         """
+        self._unsorted.append((samples, passed))
+        self._count += len(passed)
+        if self._count >= UNSORTED:
+            self._sort()
+
+    def _sort(self) -> None:
+        if not self._unsorted:
+            return
+        samples = concatenate([rows for rows, _ in self._unsorted])
+        passed = np.concatenate([times for _, times in self._unsorted])
+        self._unsorted, self._count = [], 0
         for sensor, columns in KEPT.items():
             mine = np.flatnonzero(samples.sensor == sensor)
             if len(mine):
@@ -136,6 +150,7 @@ class Examiner:
         return missing / (missing + came) if came else None
 
     def _sensor(self, sensor: int, first: int, stop: int, heard: int) -> tuple[Times, Floats]:
+        self._sort()
         parts = self._kept[sensor]
         if not parts:
             return np.empty(0, np.int64), np.empty((0, len(KEPT[sensor])))

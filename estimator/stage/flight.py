@@ -29,7 +29,7 @@ from estimator.stage.report import Sum, test_point_report
 from estimator.stage.rows import AIR, GNSS, SENSORS
 from estimator.stage.settings import Level, Reason
 from estimator.stretch import Diverged, Filtered, Smoothed, Stretch
-from estimator.synchronise import MARK, Rows, Synchroniser, concatenate, take
+from estimator.synchronise import MARK, Rows, Synchroniser, Watermark, concatenate, take
 from telemetry.messages import Message
 
 if TYPE_CHECKING:
@@ -92,10 +92,18 @@ class Flight:
         """Times of the newest step, ns; None where nothing is being flown."""
         return None if self._passage is None else self._passage.last
 
+    @property
+    def lag(self) -> int:
+        """How long a sample waits now, ns."""
+        return self._synchroniser.watermark.lag
+
     def _synchronise(self, delay: float) -> Synchroniser:
         self.delay = delay
-        self._lag = round((self.epoch.settings.lag + max(delay, self.settings.air_delay, 0.0)) * 1e9)
-        return Synchroniser(len(SENSORS), WIDTH, lag=self._lag, grid=1 << 60)
+        settings = self.epoch.settings
+        lag = round((settings.lag + max(delay, self.settings.air_delay, 0.0)) * 1e9)
+        least = None if settings.least_lag is None else round(settings.least_lag * 1e9)
+        self._watermark = Watermark(len(SENSORS), lag, least)
+        return Synchroniser(len(SENSORS), WIDTH, lag=lag, grid=1 << 60, least=least)
 
     # -- samples in ----------------------------------------------------------------------------------------------------
 
@@ -108,6 +116,10 @@ class Flight:
         if self._delay is not None:
             self._push(samples)
             yield from self._release(until, False)
+            return
+        if self._slot is not None and len(samples.t) and samples.t_rx[-1] // ASK == self._slot:
+            self._push(samples)  # in order of arrival: the others are no later
+            yield from self._release(min(until, (self._slot + 1) * ASK - 1), False)
             return
         slots = samples.t_rx // ASK  # live, the delay is asked for between two of them: whatever the batches, then
         for slot in np.unique(slots).tolist():
@@ -155,29 +167,33 @@ class Flight:
             yield from self._release(covered, False)
 
     def _push(self, samples: Rows, *, seen: bool = False) -> None:
-        marks = take(samples, samples.sensor == MARK)
-        for t, t_rx, number in zip(marks.t, marks.t_rx, marks.z[:, 0], strict=True):
-            self._synchroniser.mark(int(t), int(t_rx))
-            self._marks.append(self.epoch.marks[int(number)])
-        rest = take(samples, samples.sensor != MARK)
+        is_mark, rest = samples.sensor == MARK, samples
+        if is_mark.any():
+            marks, rest = take(samples, is_mark), take(samples, ~is_mark)
+            for t_mark, t_rx, number in zip(marks.t, marks.t_rx, marks.z[:, 0], strict=True):
+                self._synchroniser.mark(int(t_mark), int(t_rx))
+                self._marks.append(self.epoch.marks[int(number)])
         z, t = rest.z, rest.t
         fixes = rest.sensor == GNSS
         if fixes.any():
             z = z.copy()
             z[fixes, :3] = np.nan  # the place: not a specific force
-        shift = np.where(fixes, round(self.delay * 1e9), 0)
-        shift[rest.sensor == AIR] = round(self.settings.air_delay * 1e9)
-        t = t - shift
-        newest = np.maximum.accumulate(np.concatenate([[self._newest], t]))
-        self._newest = int(newest[-1])
+        if self.delay or self.settings.air_delay:
+            shift = np.where(fixes, round(self.delay * 1e9), 0)
+            shift[rest.sensor == AIR] = round(self.settings.air_delay * 1e9)
+            t = t - shift
+        self._newest = max(self._newest, int(t.max(initial=-ALL)))
+        passed = self._watermark.before(t, rest.sensor)  # as the synchroniser will say when they are released
         if not seen:
-            self.examiner.take(rest, newest[:-1] - self._lag)
+            self.examiner.take(rest, passed)
         if len(rest.t):
             self._last = int(rest.t[-1]), int(rest.t_rx[-1])
         self._synchroniser.push(rest._replace(t=t, z=z))
 
     def _release(self, until: int, final: bool) -> Iterator[Message]:
         steps = self._synchroniser.release(until, final)
+        if not len(steps.t) and not steps.marks and steps.belated is None:
+            return
         samples = Samples(steps.t, steps.t_rx, steps.z, steps.r)
         if steps.belated is not None:
             self._belated.append((np.array([t for t, _ in steps.late], np.int64), steps.belated))

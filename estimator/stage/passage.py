@@ -205,10 +205,10 @@ class Passage:
         shown = np.flatnonzero(drive.shown)
         nis, dof = np.empty(len(shown)), np.empty(len(shown), np.int64)
         _sums(square, used.sum(axis=1), drive.shown, self._left, nis, dof)
-        for channel, tally in enumerate(window.tallies):
-            tally.add(filtered.innovation[:, channel], status[:, channel].astype(np.int64))
-        for channel in FIRST_OF:
-            window.used[SENSOR_OF[channel]] += int((status[:, channel] != 0).sum())
+        for channel in np.flatnonzero(status.any(axis=0)).tolist():
+            window.tallies[channel].add(filtered.innovation[:, channel], status[:, channel].astype(np.int64))
+            if channel in FIRST_OF:
+                window.used[SENSOR_OF[channel]] += int(np.count_nonzero(status[:, channel]))
         window.doubts += int(np.count_nonzero(filtered.doubted))
         window.used["imu"] += int(steps.inertial.sum())
         for value in nis.tolist():

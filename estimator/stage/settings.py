@@ -22,6 +22,10 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     ----------
     lag : float
         How long a sample waits for older ones, s: the delay of the live estimate.
+    least_lag : float or None
+        With a number the lag follows the samples: a little more than the most by which one of them was late in the
+        last seconds, between this and `lag`. So the live estimate is as young as the link allows, and what is late for
+        the first time waits for the smoothing. None: the lag is fixed.
     grid : float
         Longest step without a measurement, s.
     gap : float
@@ -42,6 +46,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """
 
     lag: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.3
+    least_lag: Annotated[float, msgspec.Meta(ge=0, le=1e9)] | None = None
     grid: Seconds = 0.5
     gap: Seconds = 3.0
     window: Seconds = 30.0

@@ -17,6 +17,10 @@ from estimator.drive import IMPACT, IMU, MEASURED, STATIC, WIDTH
 from estimator.kinematics import ATTITUDE as ANGLES
 from estimator.stage.rows import AIR, ALTITUDE, ATTITUDE, FIX_VELOCITY, FLOW, GNSS, HEIGHT_COLUMN, INERTIAL, SENSORS
 from estimator.synchronise import Rows, take
+from estimator.ud import compiled
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 
 class _Limit(NamedTuple):
@@ -69,6 +73,20 @@ def _table() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_
 
 
 _LOW, _HIGH, _WHOLE, _STATED = _table()
+
+
+@compiled
+def _strange(
+    z: Floats, r: Floats, sensor: NDArray[np.int64], low: Floats, high: Floats, whole: Flags, stated: Flags
+) -> bool:
+    for i in range(sensor.size):
+        s = sensor[i]  # -1 of a mark is the last row of the tables
+        for c in range(z.shape[1]):
+            if z[i, c] < low[s, c] or z[i, c] > high[s, c] or (whole[s, c] and np.isnan(z[i, c])):
+                return True
+            if stated[s, c] and not (r[i, c] > SIGMA[0] and r[i, c] < SIGMA[1]):
+                return True
+    return False
 
 
 class Refusal(NamedTuple):
@@ -125,9 +143,7 @@ class Sieve:
     @staticmethod
     def _doubtful(rows: Rows) -> bool:
         """Whether there is anything to be left out; as a rule there is not, and this is quick."""
-        z, r, sensor = rows.z, rows.r, rows.sensor
-        strange = (z < _LOW[sensor]) | (z > _HIGH[sensor]) | (np.isnan(z) & _WHOLE[sensor])
-        return bool(strange.any() or (_STATED[sensor] & ~((r > SIGMA[0]) & (r < SIGMA[1]))).any())
+        return _strange(rows.z, rows.r, rows.sensor, _LOW, _HIGH, _WHOLE, _STATED)
 
     def _tell(
         self, told: list[tuple[int, Refusal]], rows: Rows, at: NDArray[np.intp], key: tuple[int, str], text: str

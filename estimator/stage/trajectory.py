@@ -60,8 +60,10 @@ class Leg:
         self.at = self.at_rx = 0
         settings = self._settings = epoch.settings
         self._synchroniser = Synchroniser(
-            len(USED), trajectory.M, lag=round(settings.lag * 1e9), grid=round(settings.grid * 1e9)
-        )
+            len(USED), trajectory.M, lag=round(settings.lag * 1e9), grid=round(settings.grid * 1e9),
+            least=None if settings.least_lag is None else round(settings.least_lag * 1e9),
+        )  # fmt: skip
+        self.watermark = self._synchroniser.watermark  # before what is at hand arrived
         self._marks: list[tuple[str, str]] = []
         self._late: list[tuple[int, int]] = []
         self._rule = Rule(scale=np.array(trajectory.SCALE))
@@ -74,6 +76,16 @@ class Leg:
         self._window = self._open(test_point)
 
     @property
+    def oldest(self) -> int:
+        """The least time of a sample that waits to become a step, ns."""
+        return self._synchroniser.oldest
+
+    @property
+    def lag(self) -> int:
+        """How long a sample waits now, ns."""
+        return self._synchroniser.watermark.lag
+
+    @property
     def test_point(self) -> str:
         """Name of the test point under way, "" for none."""
         return self._window.test_point
@@ -81,15 +93,23 @@ class Leg:
     def advance(self, rows: Rows, until: int) -> Iterator[Message]:
         """Filter what is complete, and tell the windows that close on the way."""
         model = self._model
-        marks = take(rows, rows.sensor == MARK)
-        for t, t_rx, number in zip(marks.t, marks.t_rx, marks.z[:, 0], strict=True):
-            self._synchroniser.mark(int(t), int(t_rx))
-            self._marks.append(self._epoch.marks[int(number)])
-        fixes, heights = take(rows, rows.sensor == GNSS), take(rows, rows.sensor == ALTITUDE)
-        z, r = model.gnss(fixes.z[:, 0], fixes.z[:, 1], fixes.z[:, 2], fixes.z[:, FIX_VELOCITY], fixes.r[:, :3])
-        self._synchroniser.push(fixes._replace(z=z, r=r))
-        z, r = model.altimeter(heights.z[:, HEIGHT_COLUMN], heights.r[:, HEIGHT_COLUMN])
-        self._synchroniser.push(heights._replace(z=z, r=r))
+        is_mark = rows.sensor == MARK
+        if is_mark.any():
+            marks, rows = take(rows, is_mark), take(rows, ~is_mark)
+            for t, t_rx, number in zip(marks.t, marks.t_rx, marks.z[:, 0], strict=True):
+                self._synchroniser.mark(int(t), int(t_rx))
+                self._marks.append(self._epoch.marks[int(number)])
+        z, r = np.full((len(rows.t), trajectory.M), np.nan), np.ones((len(rows.t), trajectory.M))
+        at = np.flatnonzero(rows.sensor == GNSS)
+        if len(at):
+            fixes, stated = rows.z[at], rows.r[at, :3]
+            z[at], r[at] = model.gnss(fixes[:, 0], fixes[:, 1], fixes[:, 2], fixes[:, FIX_VELOCITY], stated)
+        at = np.flatnonzero(rows.sensor == ALTITUDE)
+        if len(at):
+            z[at], r[at] = model.altimeter(rows.z[at, HEIGHT_COLUMN], rows.r[at, HEIGHT_COLUMN])
+        # The others make no steps, but time passes with them: an altitude does not wait for the next one.
+        self._synchroniser.push(rows._replace(z=z, r=r))
+        self.watermark = self._synchroniser.watermark.copy()
         yield from self._release(until, False)
 
     def finish(self, reason: Reason, until: int) -> Iterator[Message]:
@@ -101,7 +121,8 @@ class Leg:
     def _release(self, until: int, final: bool) -> Iterator[Message]:
         steps = self._synchroniser.release(until, final)
         self._late += steps.late
-        yield from self._walk(steps)
+        if len(steps.t) or steps.marks:
+            yield from self._walk(steps)
 
     # -- windows -------------------------------------------------------------------------------------------------------
 

@@ -1,64 +1,155 @@
-"""UDP: telemetry as it arrives.
+"""UDP: telemetry in datagrams.
 
-``udpin:HOST:PORT`` listens; ``udpout:HOST:PORT`` calls a station that listens, and introduces itself with a heartbeat
-once a second, because over UDP the far end cannot know where to send before it has heard from us. The host may be
-left out (``udpin:14550``): then it is the loopback address, never every interface of the machine.
+``udpin`` listens and answers those that it has heard within a minute; ``udpout`` calls a station that listens and
+introduces itself with a heartbeat once a second, because over UDP the far end cannot know where to send before it has
+heard from us.
 """
 
 from __future__ import annotations
 
 import errno
-import selectors
 import socket
-import threading
+import struct
 import time
-from collections import deque
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from selectors import EVENT_READ, BaseSelector
+from typing import Any
 
-import numpy as np
-
-from telemetry.archive import RawLog
-from telemetry.frames import Frames, scan_datagrams
-from telemetry.mavlink import Dialect
+from telemetry.sources.endpoint import Endpoint, resolve
+from telemetry.sources.port import Journal
 
 RECEIVE_BUFFER = 8 << 20
-TICK = 4_000  # ns: the resolution of receive times in the raw log
-BACKLOG = 256 << 20
+LARGEST = 65_535
+HELLO = 1.0  # s
+REMEMBERED = 60.0  # s after which a sender that is silent is no longer answered
+SENDERS = 16  # those heard last are answered: a flood of invented ones must not use up the memory
+ABSENT = 0.1  # s without sending after the far end's machine has said that nobody listens
+SO_RCVBUFFORCE = getattr(socket, "SO_RCVBUFFORCE", 33)
+SO_MEMINFO, DROPS = 55, 8  # Linux: nine counters of a socket, and the place of the datagrams dropped
 
 
-class Endpoint(NamedTuple):
-    """Where to listen or whom to call."""
-
-    scheme: str
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        return f"{self.scheme}:{self.host}:{self.port}"
+def open_port(
+    endpoint: Endpoint, link: int, selector: BaseSelector, journal: Journal, *, two_way: bool, ground: bool
+) -> UdpPort:
+    """Open ``udpin`` or ``udpout`` (`telemetry.sources.port.open_port`)."""
+    return UdpPort(endpoint, link, selector, journal, two_way=two_way, ground=ground)
 
 
-def parse_endpoint(text: str) -> Endpoint:
-    """Read ``udpin:[HOST:]PORT`` or ``udpout:[HOST:]PORT``.
+class UdpPort:
+    """A socket; both a `telemetry.sources.port.Port` and its only `Channel`."""
 
-    Raises
-    ------
-    ValueError
-        If it is neither; the text says what is expected.
-    """
-    scheme, _, rest = text.partition(":")
-    host, _, port = rest.rpartition(":")
-    if scheme not in ("udpin", "udpout") or not port.isdigit() or not 0 < int(port) < 65536:
-        raise ValueError(
-            f"{text!r} is no endpoint: write udpin:HOST:PORT to listen or udpout:HOST:PORT to call, "
-            "e.g. udpin:127.0.0.1:14550"
-        )
-    return Endpoint(scheme, host or "127.0.0.1", int(port))
+    stream = False
+
+    def __init__(
+        self, endpoint: Endpoint, link: int, selector: BaseSelector, journal: Journal, *, two_way: bool, ground: bool
+    ) -> None:
+        self.link = link
+        self.origin: object = None
+        self.closed = False
+        self.kernel_drops = 0
+        self._endpoint, self._selector, self._journal, self._two_way = endpoint, selector, journal, two_way
+        self._heard: dict[Any, float] = {}
+        self._calls = endpoint.scheme == "udpout"
+        self._hello = _heartbeat() if self._calls and not ground else b""
+        self._next_hello = self._next_count = self._absent = 0.0
+        self._socket = _open(endpoint)
+        self._peer = self._socket.getpeername() if self._calls else None
+        selector.register(self._socket, EVENT_READ, self)
+
+    def read(self) -> bytes | None:
+        """The next datagram; None when there is none, or the network says that there will be none for now."""
+        try:
+            if self._two_way:
+                piece, self.origin = self._socket.recvfrom(LARGEST)
+                return piece
+            return self._socket.recv(LARGEST)
+        except BlockingIOError:
+            return None
+        except OSError as error:  # e.g. the far end's network is gone: it may come back, and other links are there
+            self._complain(error)
+            return None
+
+    def flush(self) -> None:
+        """Nothing is ever kept to be written."""
+
+    def heard(self, origin: object) -> None:
+        """Answer `origin`; of many, those heard last."""
+        if not self._calls:
+            self._heard.pop(origin, None)
+            self._heard[origin] = time.monotonic()
+            if len(self._heard) > SENDERS:
+                del self._heard[next(iter(self._heard))]
+
+    def send(self, unit: bytes, origin: object) -> None:
+        """One datagram to whom it calls, or to each that it has heard lately."""
+        if self._calls:
+            if origin != self._peer:
+                self._put(unit, None)
+            return
+        if not self._heard:
+            self._journal.trouble(f"link {self.link}: not passed on to {self._endpoint}: nobody has been heard there")
+        for address in list(self._heard):
+            if address != origin:
+                self._put(unit, address)
+
+    def tick(self, now: float) -> None:
+        """Greet, forget who is silent, and ask the kernel what it dropped, once a second."""
+        if self._hello and now >= self._next_hello:
+            self._next_hello = now + HELLO
+            try:
+                self._socket.send(self._hello)
+            except OSError:  # nobody there yet
+                pass
+        if now >= self._next_count:
+            self._next_count = now + 1.0
+            self._count()
+            for address in [one for one, last in self._heard.items() if now - last > REMEMBERED]:
+                del self._heard[address]
+
+    def close(self) -> None:
+        """Close the socket."""
+        if not self.closed:
+            self.closed = True
+            self._count()
+            self._selector.unregister(self._socket)
+            self._socket.close()
+
+    def _put(self, unit: bytes, address: Any) -> None:
+        to = f"link {self.link}: not passed on to {self._endpoint}"
+        if self._absent and time.monotonic() < self._absent:  # each attempt would cost two errors
+            self._journal.trouble(f"{to}: nobody listens there")
+            return
+        try:
+            if address is None:
+                self._socket.send(unit)
+            else:
+                self._socket.sendto(unit, address)
+        except BlockingIOError:
+            self._journal.trouble(f"{to}: the network cannot follow")
+        except OSError as error:
+            self._complain(error, f"{to}: ")
+
+    def _complain(self, error: OSError, doing: str = "") -> None:
+        if error.errno == errno.ECONNREFUSED:
+            self._absent = time.monotonic() + ABSENT
+        doing = doing or f"link {self.link}: {self._endpoint}: "
+        self._journal.trouble(doing + (error.strerror or str(error)))
+
+    def _count(self) -> None:
+        """The drops are counted by the socket itself, so that they are known even if nothing comes after them."""
+        try:
+            counters = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 36)
+        except OSError:  # another kernel
+            return
+        if len(counters) == 36 and (drops := struct.unpack("9I", counters)[DROPS]) > self.kernel_drops:
+            text = f"link {self.link}: the kernel dropped {drops - self.kernel_drops} datagrams, {drops} so far: "
+            self.kernel_drops = drops
+            self._journal.tell("warning", text + "receiving could not follow")
 
 
 def _open(endpoint: Endpoint) -> socket.socket:
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    for option in (getattr(socket, "SO_RCVBUFFORCE", 33), socket.SO_RCVBUF):  # the first needs a privilege
+    family, address = resolve(endpoint, socket.SOCK_DGRAM)
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    for option in (SO_RCVBUFFORCE, socket.SO_RCVBUF):  # the first needs a privilege
         try:
             sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
             break
@@ -66,9 +157,9 @@ def _open(endpoint: Endpoint) -> socket.socket:
             continue
     try:
         if endpoint.scheme == "udpin":
-            sock.bind((endpoint.host, endpoint.port))
+            sock.bind(address)
         else:
-            sock.connect((endpoint.host, endpoint.port))
+            sock.connect(address)
     except OSError as error:
         sock.close()
         why = (
@@ -86,184 +177,3 @@ def _heartbeat() -> bytes:
 
     station = common.MAVLink(None, srcSystem=255, srcComponent=common.MAV_COMP_ID_MISSIONPLANNER)
     return bytes(station.heartbeat_encode(common.MAV_TYPE_GCS, common.MAV_AUTOPILOT_INVALID, 0, 0, 0).pack(station))
-
-
-class UdpSource:
-    """Datagrams of one or more endpoints, archived and framed by a thread that nothing downstream can hold up.
-
-    The thread reads, archives and frames; `batches` hands out what it has found. A consumer that falls behind by more
-    than 256 MB of telemetry misses batches, which `dropped` counts and the raw log still holds.
-
-    Parameters
-    ----------
-    endpoints : sequence of str
-    dialect : Dialect
-    raw_log : RawLog or None
-        Where the evidence goes, before it is handed out.
-    batch : float
-        Longest time a frame waits for others, s.
-
-    Attributes
-    ----------
-    dropped : int
-        Frames in batches that were not handed out.
-    troubles : dict of str to int
-        What the network complained of, and how often; receiving goes on.
-
-    Raises
-    ------
-    ValueError
-        If an endpoint does not read as one.
-    OSError
-        If an endpoint cannot be opened, e.g. because the port is in use.
-    """
-
-    def __init__(
-        self, endpoints: Sequence[str], dialect: Dialect, raw_log: RawLog | None = None, *, batch: float = 0.01
-    ) -> None:
-        self.endpoints = [parse_endpoint(text) for text in endpoints]
-        self.links = [str(i) for i in range(len(self.endpoints))]
-        self.dropped = 0
-        self.troubles: dict[str, int] = {}
-        self._dialect = dialect
-        self._raw_log = raw_log
-        self._batch = batch
-        self._sockets: list[socket.socket] = []
-        try:
-            self._sockets = [_open(endpoint) for endpoint in self.endpoints]
-        except OSError:
-            self._close()
-            raise
-        self._queue: deque[Frames] = deque()
-        self._queued = 0
-        self._ready = threading.Condition()
-        self._stopping = threading.Event()
-        self._done = False
-        self._failure: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="sortie-receive", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop receiving; `batches` ends when it has handed out what was received."""
-        self._stopping.set()
-
-    def join(self) -> None:
-        """Wait until the receiving thread has ended and the raw log is closed."""
-        self._thread.join()
-
-    def batches(self, idle: float | None = None) -> Iterator[Frames]:
-        """Yield what has arrived, in order, until `stop`.
-
-        Parameters
-        ----------
-        idle : float, optional
-            Stop by itself when nothing has arrived for so long, s, counted from the first arrival.
-
-        Raises
-        ------
-        Exception
-            What ended the receiving thread, if anything did.
-        """
-        last: float | None = None
-        while True:
-            with self._ready:
-                if not self._queue and not self._done:
-                    self._ready.wait(0.1)
-                frames = self._queue.popleft() if self._queue else None
-                if frames is not None:
-                    self._queued -= len(frames.data)
-                elif self._done:
-                    break
-            if frames is not None:
-                last = time.monotonic()
-                yield frames
-            elif idle is not None and last is not None and time.monotonic() - last > idle:
-                self.stop()
-        self._thread.join()
-        if self._failure:
-            raise self._failure
-
-    def _run(self) -> None:
-        try:
-            self._receive()
-        except Exception as error:  # the consumer is told; the thread has nobody to tell
-            self._failure = error
-        finally:
-            self._close()
-            if self._raw_log:
-                self._raw_log.close()
-            with self._ready:
-                self._done = True
-                self._ready.notify()
-
-    def _receive(self) -> None:
-        anchor = time.time_ns() - time.monotonic_ns()  # one anchor: a step of the system clock does not reach us
-        selector = selectors.DefaultSelector()
-        for link, sock in enumerate(self._sockets):
-            selector.register(sock, selectors.EVENT_READ, link)
-        calling = [s for s, e in zip(self._sockets, self.endpoints, strict=True) if e.scheme == "udpout"]
-        hello = _heartbeat() if calling else b""
-        said = -1.0
-        last = 0
-        pieces: list[tuple[int, int, bytes]] = []
-        oldest = 0.0
-        while True:
-            stopping = self._stopping.is_set()  # what has arrived by now is still taken
-            now = time.monotonic()
-            if calling and now - said >= 1.0:
-                said = now
-                for sock in calling:
-                    try:
-                        sock.send(hello)
-                    except OSError:  # nobody there yet
-                        pass
-            for key, _ in selector.select(0.0 if stopping else self._batch if pieces else 0.05):
-                for _ in range(256):  # a busy link must not starve the others
-                    datagram = self._read(key.fileobj)
-                    if datagram is None:
-                        break
-                    last = max((time.monotonic_ns() + anchor) // TICK * TICK, last + TICK)
-                    if not pieces:
-                        oldest = time.monotonic()
-                    pieces.append((last, key.data, datagram))
-            if pieces and (stopping or time.monotonic() - oldest >= self._batch or len(pieces) >= 1024):
-                self._hand_over(pieces)
-                pieces = []
-            elif self._raw_log:
-                self._raw_log.sync(force=False)
-            if stopping:
-                return
-
-    def _read(self, sock: Any) -> bytes | None:
-        """The next datagram; None when there is none, or the network says that there will be none for now."""
-        try:
-            return bytes(sock.recv(65535))
-        except BlockingIOError:
-            return None
-        except OSError as error:  # e.g. the far end's network is gone: it may come back, and other links are there
-            self.troubles[error.strerror or str(error)] = self.troubles.get(error.strerror or str(error), 0) + 1
-            return None
-
-    def _hand_over(self, pieces: list[tuple[int, int, bytes]]) -> None:
-        data = np.frombuffer(b"".join(piece for _, _, piece in pieces), np.uint8)
-        bounds = np.cumsum([0] + [len(piece) for _, _, piece in pieces])
-        frames = scan_datagrams(
-            data,
-            bounds,
-            np.array([t for t, _, _ in pieces], np.int64),
-            np.array([link for _, link, _ in pieces], np.uint8),
-            self._dialect.crc_extra,
-        )
-        if self._raw_log:
-            self._raw_log.write(frames)
-        with self._ready:
-            if self._queued > BACKLOG:
-                self.dropped += len(frames)
-            else:
-                self._queue.append(frames)
-                self._queued += len(frames.data)
-            self._ready.notify()
-
-    def _close(self) -> None:
-        for sock in self._sockets:
-            sock.close()

@@ -161,3 +161,82 @@ def test_batches_do_not_change_the_steps(arrived, cuts):
         )
     assert [m[0] for p in parts for m in p.marks] == [m[0] for m in whole.marks]
     assert sorted(x for p in parts for x in p.late) == sorted(whole.late)
+
+
+def adaptive(lag=300, least=5):
+    return Synchroniser(2, 3, lag=lag * MS, grid=10_000 * MS, least=least * MS)
+
+
+def stream(until, late=0, period=10, begin=1000):
+    """Sensor 0 in time every `period` ms, sensor 1 every 100 ms and `late` ms behind; in the order of arrival."""
+    prompt = [(t, t, 0, 1.0) for t in range(begin, until, period)]
+    behind = [(t, t + late, 1, 1.0) for t in range(begin, until, 100)]
+    return sorted(prompt + behind, key=lambda sample: sample[1])
+
+
+def released(s, samples):
+    """How long each step waited after its own time (ms), released arrival by arrival."""
+    waited = {}
+    late = 0
+    for sample in samples:
+        s.push(rows([sample]))
+        steps = s.release(sample[1] * MS)
+        late += len(steps.late)
+        waited |= dict.fromkeys(times(steps), sample[1])
+    return {t: at - t for t, at in waited.items()}, late
+
+
+def test_the_lag_falls_to_the_least_where_nothing_is_late():
+    waited, late = released(adaptive(), stream(40_000))
+    assert late == 0
+    assert all(wait == 300 for t, wait in waited.items() if t < 10_000)
+    assert max(wait for t, wait in waited.items() if t > 25_000) <= 10
+
+
+def test_the_lag_stays_a_little_more_than_the_latest_sample():
+    waited, late = released(adaptive(), stream(40_000, late=83))
+    assert late == 0
+    assert all(83 <= wait <= 120 for t, wait in waited.items() if t > 25_000)
+
+
+def test_what_is_late_for_the_first_time_is_told_and_is_waited_for_from_then_on():
+    early, later = stream(40_000), stream(60_000, late=150, begin=40_000)
+    s = adaptive()
+    _, late = released(s, early)
+    assert late == 0
+    waited, late = released(s, sorted(later, key=lambda sample: sample[1]))
+    assert late == 2, "the second had been passed when the first came"
+    assert {t for t, _, sensor, _ in later if sensor == 1} <= set(waited) | set(range(59_700, 60_000))
+
+
+def test_time_passes_with_the_sensors_that_make_no_steps():
+    s = Synchroniser(1, 3, lag=20 * MS, grid=10_000 * MS)
+    s.push(rows([(1000, 1, 0, 1.0), (1019, 2, 1, 1.0)]))
+    assert times(s.release(2 * MS)) == []
+    s.push(rows([(1020, 3, 1, 1.0)]))
+    steps = s.release(3 * MS)
+    assert times(steps) == [1000] and steps.used.tolist() == [[1]]
+    s.push(rows([(1000, 4, 1, 1.0)]))
+    assert not s.release(4 * MS).late
+
+
+@given(
+    samples=st.lists(st.tuples(st.integers(0, 60_000), st.integers(0, 40), st.integers(0, 2)), min_size=1, max_size=40),
+    cuts=st.lists(st.integers(0, 60), max_size=6),
+)
+@settings(max_examples=60, deadline=None)
+def test_a_lag_that_follows_the_samples_does_not_depend_on_the_cuts(samples, cuts):
+    ordered = sorted((t, 1 + i, sensor, float(i)) for i, (t, _, sensor) in enumerate(samples))
+    arriving = [(t, k + 1, sensor, value) for k, (t, _, sensor, value) in enumerate(ordered[::-1] + ordered)]
+    whole = adaptive()
+    whole.push(rows(arriving))
+    once = whole.release(len(arriving) * MS)
+    pieces = adaptive()
+    got, late = [], []
+    for sample in arriving:
+        pieces.push(rows([sample]))
+        if sample[1] in cuts or sample is arriving[-1]:
+            steps = pieces.release(sample[1] * MS)
+            got += times(steps)
+            late += steps.late
+    assert got == times(once) and late == once.late

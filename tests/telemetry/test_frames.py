@@ -98,6 +98,16 @@ def test_an_unknown_id_is_a_frame_only_where_framing_on_both_sides_agrees():
     assert found.discarded == len(sender.unknown()) + 1
 
 
+def test_an_unknown_id_with_a_good_frame_in_it_is_a_false_start():
+    sender = Sender()
+    good = [sender.attitude(i) for i in range(17)]
+    for size in range(256):  # wherever it claims to end, also where the next frame begins
+        start = bytes([STX2, size, 0, 0, 0, 1, 1]) + (15_000_000).to_bytes(3, "little") + b"?"
+        assert scan(start + b"".join(good)).known.sum() == 17
+        log = tlog([(US, start), *((US + i, frame) for i, frame in enumerate(good))])
+        assert join(read(log)).known.sum() == 17
+
+
 def test_flags_from_the_future_are_not_parsed():
     frame = bytearray(Sender().attitude(1))
     frame[2] = 2
@@ -168,6 +178,9 @@ def archived(batch: Frames, links: int) -> bytes:
         return log.path.read_bytes()
 
 
+JUNK_COLUMNS = ("junk_t_rx", "junk_link", "junk_corrupt", "junk_refused")
+
+
 def evidence(batch: Frames) -> tuple:
     """All that a batch says, in Python's types."""
     frames = [
@@ -175,8 +188,7 @@ def evidence(batch: Frames) -> tuple:
         for i in range(len(batch))
     ]
     junk = [
-        (batch.junk(i), *(int(getattr(batch, name)[i]) for name in ("junk_t_rx", "junk_link", "junk_corrupt")))
-        for i in range(len(batch.junk_start))
+        (batch.junk(i), *(int(getattr(batch, name)[i]) for name in JUNK_COLUMNS)) for i in range(len(batch.junk_start))
     ]
     return frames, junk
 
@@ -210,6 +222,47 @@ def test_our_archive_reads_as_what_arrived_however_it_is_cut(datagrams, links, c
         assert before.until <= after.until
         assert (after.t_rx > before.until).all()
         assert (after.junk_t_rx > before.until).all()
+
+
+@given(arrivals)
+@settings(max_examples=300, deadline=None)
+def test_a_datagram_alone_gives_what_it_gives_among_others(datagram):
+    alone, among = scan(datagram), scan(datagram, b"", b"")
+    assert evidence(alone) == evidence(among)
+    assert alone.sysid.tolist() == among.sysid.tolist()
+    assert alone.compid.tolist() == among.compid.tolist()
+    for name in alone.__dataclass_fields__:
+        one, other = getattr(alone, name), getattr(among, name)
+        if isinstance(one, np.ndarray):
+            assert (one.dtype, one.shape, one.flags.c_contiguous) == (other.dtype, other.shape, True)
+    assert alone.until == int(alone.t_rx[0]) if len(alone) else 1_000_000
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_every_damage_to_a_lone_frame_is_seen(version):
+    whole = Sender(3, 7, seq=200, version=version).attitude(5)
+    assert scan(whole).known.tolist() == [True]
+    for place in range(len(whole)):
+        for bit in range(8):
+            damaged = bytearray(whole)
+            damaged[place] ^= 1 << bit
+            assert not scan(bytes(damaged)).known.any()
+    for end in range(len(whole)):
+        assert not len(scan(whole[:end]))
+
+
+@given(st.lists(arrivals, min_size=1, max_size=6), st.integers(1, 4), st.data())
+@settings(max_examples=100, deadline=None)
+def test_refused_frames_are_runs_of_their_own_live_and_out_of_the_archive(datagrams, links, data):
+    batch = scan(*datagrams, links=links)
+    mask = np.array(data.draw(st.lists(st.booleans(), min_size=len(batch), max_size=len(batch))), np.bool_)
+    live = batch.refuse(mask)
+    assert [live.frame(i) for i in range(len(live))] == [batch.frame(i) for i in np.flatnonzero(~mask)]
+    assert live.junk_refused.sum() == (mask & batch.known).sum()
+    assert live.junk_corrupt.sum() == batch.junk_corrupt.sum()
+    assert live.discarded + live.length.sum() == sum(map(len, datagrams))
+    assert (np.diff(live.junk_start) > 0).all()
+    assert evidence(join(read(archived(live, links), links=links))) == evidence(live)
 
 
 def test_every_cut_inside_a_junk_record_waits_for_the_rest():

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from telemetry.frames import Frames
-from telemetry.ingest import Settings, ingest
+from telemetry.ingest import Settings, guarded, ingest
 from telemetry.mavlink import Dialect
 from telemetry.messages import (
+    AirData,
     Altitude,
     ClockFit,
     Event,
@@ -162,7 +165,7 @@ def test_messages_without_a_time_take_that_of_their_neighbours():
     sender = Sender()
     log = [(US, sender.attitude(1000)), (US + 5, sender.text("TP 1 start")), (US + 9, sender.attitude(2000))]
     messages = run(read(tlog(log)))
-    assert told(messages, Mark)[0].t[0] == US * 1000
+    assert US * 1000 <= told(messages, Mark)[0].t[0] <= (US + 9) * 1000
     assert told(messages, StatusText)[0].text == ["TP 1 start"]
 
 
@@ -242,6 +245,13 @@ def test_every_byte_is_in_the_account_and_damage_is_told():
     assert any("the log ends inside a record" in text for text in texts(messages))
 
 
+def test_a_rest_that_comes_alone_in_the_last_block_is_told():
+    log = tlog(flight(2))
+    messages = run(read(log + log[:12], [len(log)]))
+    assert told(messages, LinkBytes)[-1].pending[-1] == 12
+    assert any("the log ends inside a record: its last 12 bytes" in text for text in texts(messages))
+
+
 def test_a_frame_of_an_unknown_id_fills_its_number_and_is_counted():
     sender = Sender()
     messages = run([scan(sender.attitude(1), sender.unknown(), sender.attitude(2))])
@@ -283,11 +293,11 @@ def test_a_mark_from_the_ground_is_one_of_every_vehicle_at_its_own_time():
     log = flight(4) + drifting + ground((2.05, "TP 3 start @0"), (2.55, "TP 3 stop @0"))
     messages = run(read(tlog(sorted(log))))
     t = (US + 1) * 1000
-    assert marks(messages) == [
-        (1, 0, "start", "3", t + 2_000_000_000),
-        (1, 0, "stop", "3", t + 2_500_000_000),
-        (2, 0, "start", "3", US * 1000 + 1_900_000_000),
-        (2, 0, "stop", "3", US * 1000 + 2_375_000_000),
+    assert marks(messages) == [  # in the middle between two readings, which are 250 and 95 ms apart
+        (1, 0, "start", "3", t + 2_125_000_000),
+        (1, 0, "stop", "3", t + 2_625_000_000),
+        (2, 0, "start", "3", US * 1000 + 1_900_000_000 + 47_500_000),
+        (2, 0, "stop", "3", US * 1000 + 2_375_000_000 + 47_500_000),
     ]
     assert {m.vehicle for m in told(messages, StatusText)} == {255}
     assert "ground station 255/190 marks the start of test point 3" in texts(messages)
@@ -377,6 +387,129 @@ def test_whatever_a_ground_station_says_harms_nothing(said, system):
     assert sum(len(m.t) for m in told(messages, Altitude)) == 12
     assert {m.boot for m in told(messages, Altitude)} == {0}
     assert not [m for m in told(messages, LinkStats) if m.source == "0/1" and m.lost[-1]]
+
+
+def empty(us: int) -> Frames:
+    """Receive time has come so far, and nothing with it."""
+    nothing = scan()
+    return replace(nothing, until=us * 1000)
+
+
+def test_empty_batches_change_nothing_but_how_far_time_has_come():
+    log = flight(30, reboot_at=15)
+    whole = read(tlog(log))
+    parts = [batch for us, frame in log for batch in (*read(tlog([(us, frame)])), empty(us + 1))]
+    last = log[-1][0]
+    waited = run(parts + [empty(last + 1_000_000 * s) for s in range(1, 5)])
+    found, expected = columns(waited), columns(run(whole))
+    for key, rows in expected.items():
+        if key[0] == "Event":
+            assert found[key]["text"].tolist() == rows["text"].tolist()
+        elif key[0] != "LinkStats":
+            assert_same({key: found[key]}, {key: rows})
+    assert told(waited, Progress)[-2].t_rx[-1] == (last + 4_000_000) * 1000
+    stats = {key: rows for key, rows in expected.items() if key[0] == "LinkStats"}
+    for key, rows in stats.items():
+        inside = rows["t_rx"][:-1]
+        assert found[key]["t_rx"][: len(inside)].tolist() == inside.tolist()
+
+
+def test_an_empty_batch_says_only_how_far_time_has_come():
+    (said,) = [m for m in run([empty(US)]) if not m.final]
+    assert isinstance(said, Progress) and said.t_rx[-1] == US * 1000
+
+
+class Log:
+    """What `guarded` looks at of a raw log and of a source."""
+
+    def __init__(self) -> None:
+        self.path, self.error, self.warning = "raw.tlog", None, None
+        self.notes: list[str] = []
+        self.dropped = 0
+        self.waiting: list[tuple[int, str, str]] = []
+
+    def news(self):
+        waiting, self.waiting = self.waiting, []
+        return waiting
+
+
+def test_trouble_is_told_at_once_while_nothing_arrives():
+    log = Log()
+
+    def batches() -> Iterator[Frames]:
+        for i, change in enumerate(
+            [
+                {},
+                {"error": "disk full"},
+                {},
+                {"error": None, "warning": "disk nearly full"},
+                {"warning": None, "dropped": 7},
+                {"notes": ["a hole", "a repair"], "waiting": [(5, "info", "link 0: connected")]},
+                {},
+            ]
+        ):
+            vars(log).update(change)
+            yield empty(US + i * 100_000)
+
+    said = [
+        (round(m.t_rx[0] / 1e3 - US) if m.t_rx[0] > 5 else 5, m.level[0], m.text[0])
+        for m in guarded(ingest(batches(), ["0"], DIALECT), log, log)
+        if isinstance(m, Event)
+    ]
+    assert said == [
+        (100_000, "error", "ALARM: disk full"),
+        (300_000, "info", "raw.tlog: raw telemetry is being kept again"),
+        (300_000, "warning", "disk nearly full"),
+        (400_000, "info", "raw.tlog: there is room for raw telemetry again"),
+        (400_000, "error", "ALARM: 7 frames are in the raw log only: ingest could not follow"),
+        (5, "info", "link 0: connected"),
+        (500_000, "warning", "a hole"),
+        (500_000, "warning", "a repair"),
+    ]
+
+
+def test_frames_refused_for_their_signature_are_in_the_account():
+    sender = Sender()
+    frames = scan(sender.attitude(1), sender.attitude(2), sender.attitude(3))
+    messages = run([frames.refuse(np.array([False, True, False]))])
+    account = told(messages, LinkBytes)[-1]
+    assert (account.frames[-1], account.refused[-1], account.corrupt[-1]) == (2, 1, 0)
+    assert account.bytes[-1] == frames.length.sum()
+    assert account.discarded[-1] == frames.length[1]
+    assert told(messages, LinkStats)[-1].lost[-1] == 1
+
+
+@pytest.mark.parametrize("steps", [(3,), (-3,), (5, -5), (-2, 2)])
+def test_a_ground_clock_that_steps_by_hours_changes_neither_boots_nor_losses(steps):
+    """It steps after every 100 s of flight, and there five frames are lost."""
+    sender, log, shift = Sender(), [], 0
+    for i in range(4000):
+        if i and i % 1000 == 0 and i // 1000 <= len(steps):
+            shift += steps[i // 1000 - 1] * 3_600_000_000
+            for _ in range(5):
+                sender.pressure(1, 900)
+        log.append((US + 100_000 * i + shift, sender.pressure(5000 + 100 * i, 900)))
+    messages = run(read(tlog(log)))
+    stats = told(messages, LinkStats)[-1]
+    assert (stats.received[-1], stats.lost[-1], stats.restarted[-1]) == (4000, 5 * len(steps), 0)
+    samples = told(messages, Altitude)
+    assert {m.boot for m in samples} == {0}
+    assert (np.diff(np.concatenate([m.t for m in samples])) == 100_000_000).all()
+    fit = told(messages, ClockFit)[-1]
+    assert fit.valid[-1] and abs(fit.rate[-1]) < 1e-5
+    assert sum("the receive clock stepped" in text for text in texts(messages)) == len(steps)
+
+
+def test_vehicle_time_without_a_field_has_a_sigma_and_a_told_one_has_none():
+    sender, log = Sender(), []
+    for i in range(100):
+        log.append((US + 100_000 * i, sender.pressure(5000 + 100 * i, 900)))
+        log.append((US + 100_000 * i + 40_000, sender.pack(mavlink.MAVLink_vfr_hud_message(20, 21, 90, 50, 100, 0))))
+    messages = run(read(tlog(log)))
+    air = [m for m in told(messages, AirData) if m.t_sigma is not None]
+    sigma = np.concatenate([m.t_sigma for m in air])[5:]
+    np.testing.assert_allclose(sigma, 0.1 / np.sqrt(12), rtol=0.05)
+    assert all(m.t_sigma is None for m in told(messages, Altitude))
 
 
 def test_nothing_in_nothing_out_but_the_end():

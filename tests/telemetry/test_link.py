@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from telemetry.clock import BootClock
 from telemetry.link import LinkAccounts, LossAccount, Rows
+from telemetry.loss import BEGUN, CONTINUES, COPY, UNKNOWN_ID
 from tests.telemetry.test_clock import read
 
 SECOND = 1_000_000_000
@@ -24,8 +25,7 @@ def columns(frames):
         (np.array(number) & 255).astype(np.uint8),
         np.array(t, np.int64),
         np.array(digest, np.int64),
-        np.array(restarted, bool),
-        np.array(continued, bool),
+        (BEGUN * np.array(restarted) + CONTINUES * np.array(continued)).astype(np.uint8),
     )
 
 
@@ -282,7 +282,7 @@ def test_accounts_of_many_senders():
         mine = link * 9 + sysid * 3 + compid == key
         seq[mine] = np.arange(mine.sum()) % 256
     t_rx = np.sort(rng.integers(0, 20 * SECOND, count))
-    digest, flags = np.arange(count), np.zeros(count, bool)
+    digest, flags = np.arange(count), np.zeros(count, np.uint8)
     whole, parts = LinkAccounts(), LinkAccounts()
     whole.feed(link, sysid, compid, seq, t_rx, digest, flags)
     for i in range(0, count, 7):
@@ -317,7 +317,8 @@ def test_loss_of_a_real_flight_with_four_reboots():
     found = BootClock(1).feed(*log.cut(0, None), flush=True)
     continued = found.timed & ~found.restarted
     account = LossAccount()
-    account.feed(log.seq, log.t_rx, np.arange(len(log.seq)), found.restarted, continued)
+    marks = (BEGUN * found.restarted + CONTINUES * continued).astype(np.uint8)
+    account.feed(log.seq, log.t_rx, np.arange(len(log.seq)), marks, np.where(found.timed, found.t, 0))
     account.finish(int(log.t_rx[-1]))
     rows, counters = account.rows(), account.counters
     assert (counters["restarted"], counters["received"]) == (4, len(log.seq))
@@ -325,3 +326,52 @@ def test_loss_of_a_real_flight_with_four_reboots():
     for reboot in np.flatnonzero(found.restarted):
         around = np.abs(rows.t_rx - log.t_rx[reboot]) < 5 * SECOND
         assert np.ptp(rows.ambiguous[around]) == 0
+
+
+def marked(frames, bits, told=None):
+    """Counters at the end of frames with marks of their own, and the vehicle's time where it is told."""
+    account = LossAccount()
+    seq, t_rx, digest, _ = columns(frames)
+    account.feed(seq, t_rx, digest, np.array(bits, np.uint8), told)
+    account.finish(int(t_rx[-1]) + SECOND // 2)
+    return account.counters
+
+
+def test_unknown_ids_and_copies_are_counted_and_are_no_loss():
+    counters = marked(steady([1, 2, 3, 4]), [0, UNKNOWN_ID, COPY, UNKNOWN_ID | COPY])
+    assert (counters["unknown"], counters["redundant"]) == (2, 2)
+    assert (counters["received"], counters["lost"], counters["duplicate"]) == (4, 0, 0)
+
+
+def test_a_restart_after_an_outage_does_not_take_its_losses_back():
+    """The clock went on behind the outage, so the jump was lost numbers; the restart comes 3 s later."""
+    frames = steady(range(1000))
+    t = frames[-1][1]
+    frames += [(1250 + i, t + (251 + i) * 10 * MS, i, False, True) for i in range(250)]
+    frames += [(i, frames[-1][1] + (i + 1) * 10 * MS, 5000 + i, i == 0, i > 0) for i in range(200)]
+    counters = closed(frames)
+    assert (counters["restarted"], counters["lost"]) == (1, 250)
+
+
+@pytest.mark.parametrize("missing", [0, 1, 30])
+def test_a_receive_clock_that_steps_forward_is_no_silence(missing):
+    """It steps by two hours while the vehicle's clock goes on, and a few frames are lost there as well."""
+    frames = steady(range(1000))
+    t = frames[-1][1]
+    frames += [(1000 + missing + i, t + 7200 * SECOND + i * 10 * MS, i, False, True) for i in range(900)]
+    numbers = np.array([n for n, *_ in frames])
+    counters = marked(frames, [CONTINUES] * len(frames), numbers * 10 * MS + SECOND)
+    assert (counters["lost"], counters["received"]) == (missing, 1900)
+
+
+def test_two_outages_one_after_the_other():
+    frames = steady(range(2000))
+    for missing in (400, 400):
+        number, t = frames[-1][:2]
+        begin = number + missing
+        frames += [(begin + i, t + (missing + i) * 10 * MS, begin + i, False, True) for i in range(1, 101)]
+    number, t = frames[-1][:2]
+    frames += [(number + i, t + i * 10 * MS, number + i, False, True) for i in range(1, 900)]
+    counters = closed(frames)
+    assert counters["conflict"] == counters["late"] == 0
+    assert counters["lost"] == 800

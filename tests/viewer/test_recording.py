@@ -323,3 +323,67 @@ def test_recorder_can_be_fed_message_by_message(tmp_path):
     recorder.flush()
     summary = recorder.close()
     assert len(summary.windows) == 1 and len(stored([window])["/v1/est/window/altitude"]) == len(window.t)
+
+
+def test_how_consumers_keep_up_is_recorded_and_told(tmp_path):
+    begin = int(f.flight()[0].t[0])
+    t = begin + 1_000_000_000 * np.arange(3)
+    age = np.array([0.01, 0.02, 0.03])
+    health = m.Health(
+        vehicle=0, source="record", stage="estimate", boot=0, t=t, t_rx=t, age_p50=age, age_p99=2 * age[::-1],
+        age_max=np.array([np.nan, 4.0, 1.0]), messages=np.array([10, 20, 30]), missing=np.array([0, 0, 1]),
+        backfilled=np.array([0, 2, 2]), refused=np.array([0, 0, 0]),
+    )  # fmt: skip
+    path = tmp_path / "health.rrd"
+    summary = record([*f.flight(), health], path, sortie="h", interval=None)
+    (kept,) = summary.consumers
+    assert (kept.consumer, kept.stage, kept.age_p99, kept.age_max) == ("record", "estimate", 0.06, 4.0)
+    assert (kept.messages, kept.missing, kept.backfilled, kept.refused) == (30, 1, 2, 0)
+    at, ages = column(path, "/health/record/estimate/age", "Scalars:scalars")
+    assert np.array_equal(at, t) and np.array_equal(ages[:, 0], age)
+    _, counters = column(path, "/health/record/estimate/counters", "Scalars:scalars")
+    assert counters[-1].tolist() == [30, 1, 2, 0]
+    assert review(path).summary.consumers == [kept]
+
+
+def test_the_ages_of_a_recording_that_was_not_closed_are_still_found(tmp_path):
+    t = int(f.flight()[0].t[0]) + np.zeros(1, np.int64)
+    one = np.array([1])
+    health = m.Health(
+        vehicle=0, source="estimate", stage="ingest", boot=0, t=t, t_rx=t, age_p50=one * 0.1, age_p99=one * 0.2,
+        age_max=one * 0.3, messages=one, missing=one, backfilled=one, refused=one,
+    )  # fmt: skip
+    recorder = Recorder(tmp_path / "open.rrd", sortie="o", interval=0.1)
+    for message in [health, *f.flight()]:
+        recorder.write(message)
+    recorder.flush()
+    found = review(tmp_path / "open.rrd")
+    assert not found.closed
+    (kept,) = found.summary.consumers
+    assert (kept.consumer, kept.stage, kept.age_p99, kept.age_max, kept.missing) == ("estimate", "ingest", 0.2, 0.3, 1)
+    recorder.close()
+
+
+def test_a_stream_that_is_only_compared_stands_beside_the_one_that_is_used(tmp_path):
+    imu = next(message for message in f.flight() if isinstance(message, m.Imu))
+    other = msgspec.structs.replace(imu, source="0/1.2", chosen=False, angular_rate=imu.angular_rate + 1.0)
+    path = tmp_path / "two.rrd"
+    record([other, imu], path, sortie="t", interval=None)  # the one that is not used is heard first
+    _, used = column(path, "/v1/raw/imu/angular_rate", "Scalars:scalars")
+    _, compared = column(path, "/v1/raw/imu.1.2/angular_rate", "Scalars:scalars")
+    for rows, sent in ((used, imu), (compared, other)):
+        assert np.array_equal(rows[np.isfinite(rows[:, 0])], sent.angular_rate)
+
+
+def test_plain_numbers_are_sent_as_the_archetypes_send_them():
+    from viewer.sink import _MEASUREMENTS, _SCALARS, numbers
+
+    values, variances = np.arange(6.0).reshape(3, 2), np.array([1.0, np.nan, 3.0])
+    for ours, theirs in (
+        (numbers(_SCALARS, values), rr.Scalars.columns(scalars=values)),
+        (numbers(_MEASUREMENTS, variances, variances), rr.Measurements.columns(values=variances, variances=variances)),
+    ):
+        for a, b in zip(ours, theirs, strict=True):
+            assert str(a.component_descriptor()) == str(b.component_descriptor())
+            assert a.as_arrow_array().type == b.as_arrow_array().type
+            assert repr(a.as_arrow_array().to_pylist()) == repr(b.as_arrow_array().to_pylist())

@@ -6,8 +6,9 @@ import threading
 
 import pytest
 
-from configuration import Failure, configure
-from wiring import ahead
+from configuration import configure
+from offline import ahead
+from telling import Failure
 
 
 def test_what_is_worked_out_ahead_comes_in_order():
