@@ -24,6 +24,7 @@ Times = NDArray[np.int64]
 
 MARK = -1
 MEMORY = 10_000_000_000  # ns of vehicle time in which the lateness of samples is looked for
+LEARNING = 3_000_000_000  # ns at the beginning of which nothing is known yet
 NEVER = np.iinfo(np.int64).max
 LONGEST_SILENCE = 2000  # steps put into one silence at most; beyond that they lie further apart
 
@@ -90,7 +91,7 @@ class Watermark:
     """The time that has been passed and is no longer waited for: the newest time seen, less the lag.
 
     With `least` given the lag follows the samples: it is a little more than the most by which one of them came behind
-    the newest time in the last `MEMORY` to twice that, between `least` and `lag`. Until so much has been seen it is
+    the newest time in the last `MEMORY` to twice that, between `least` and `lag`. For the first `LEARNING` it is
     `lag`. Time passed never goes back.
 
     Parameters
@@ -277,7 +278,8 @@ def _pass(
         if t[i] > newest:
             newest = t[i]
             if newest - begin >= MEMORY:
-                before, now, begin = (lag if begin < -MEMORY else now), 0, newest
+                first = begin < -MEMORY
+                before, now, begin = (lag if first else now), 0, newest - (MEMORY - LEARNING if first else 0)
         elif sensor[i] < sensors:
             now = max(now, newest - t[i])
         most = max(now, before)

@@ -99,16 +99,21 @@ def smoothed(messages, boot=0):
 FLIGHT = flight()
 
 
-@given(st.lists(st.integers(1, len(FLIGHT) - 1), max_size=30), st.sampled_from(["window", "sortie"]))
+@given(
+    st.lists(st.integers(1, len(FLIGHT) - 1), max_size=30),
+    st.sampled_from(["window", "sortie"]),
+    st.sampled_from([None, 0.0, 0.02]),
+)
 @settings(max_examples=15, deadline=None)
-def test_batches_do_not_change_a_bit(cuts, scope):
+def test_batches_do_not_change_a_bit(cuts, scope, least_lag):
     messages = [
         *FLIGHT,
         mark(1010, "start", "1"),
         mark(1022, "stop", "1"),
         *flight(20, boot=1, begin=1100, silence=[(5, 11)]),
     ]
-    whole, parts = run(messages, scope=scope), run(messages, cuts, scope=scope)
+    options = Settings(least_lag=least_lag)
+    whole, parts = run(messages, None, scope, options), run(messages, cuts, scope, options)
     for boot in (0, 1):
         for a, b in ((live(whole, boot), live(parts, boot)), (smoothed(whole, boot), smoothed(parts, boot))):
             for name in a:

@@ -30,14 +30,19 @@ PATIENT = 60.0
 def received(folder: Path, count: int | None = None):
     """What the first stage tells: what has been received since the beginning at once, then what is being received.
 
-    Like a raw log, it is the same whenever it is read. It ends when the file `end` is there.
+    Like a raw log, it is the same whenever it is read. It holds what was received until the file `end` was made.
     """
-    begin = (folder / "begin").stat().st_mtime
+    begin, end = (folder / "begin").stat().st_mtime, folder / "end"
     i = 0
-    while not (folder / "end").exists() if count is None else i < count:
-        if count is None and time.time() < begin + i / RATE:
-            time.sleep(0.001)
-            continue
+    while True:
+        if count is None:
+            if end.exists() and i >= (end.stat().st_mtime - begin) * RATE:
+                break
+            if time.time() < begin + i / RATE:
+                time.sleep(0.001)
+                continue
+        elif i >= count:
+            break
         t = np.array([i * 1_000_000])
         yield Altitude(
             vehicle=1, source="0/1", boot=0, t=t, t_rx=t, altitude=t * 0.5, pressure=t * 1.0, sigma=np.ones(1)
@@ -179,7 +184,9 @@ def test_killed_at_any_moment_the_recording_is_that_of_one_whole_run(seed, tmp_p
             if draw.random() < 0.5:
                 time.sleep(draw.uniform(0.0, 0.5))
             processes.start(victim)
-        wait_for(lambda: processes.recorded() > 400)
+        # What is recorded then was heard after the last restart: all are there again.
+        again = (time.time() - (tmp_path / "begin").stat().st_mtime) * RATE
+        wait_for(lambda: processes.recorded() > again)
         lines = processes.end("record", "estimate", "ingest")
     check(lines, tmp_path)
 

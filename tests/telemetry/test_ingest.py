@@ -247,9 +247,9 @@ def test_every_byte_is_in_the_account_and_damage_is_told():
 
 def test_a_rest_that_comes_alone_in_the_last_block_is_told():
     log = tlog(flight(2))
-    messages = run(read(log + log[:12], [len(log)]))
-    assert told(messages, LinkBytes)[-1].pending[-1] == 12
-    assert any("the log ends inside a record: its last 12 bytes" in text for text in texts(messages))
+    messages = run(read(log + log[:20], [len(log)]))
+    assert told(messages, LinkBytes)[-1].pending[-1] == 20
+    assert any("the log ends inside a record: its last 20 bytes" in text for text in texts(messages))
 
 
 def test_a_frame_of_an_unknown_id_fills_its_number_and_is_counted():
