@@ -260,9 +260,53 @@ def decode(*log: Path, dialect: str = "ardupilotmega", rounds: int = 3, json: bo
         console.print(table)
 
 
+def pipeline(
+    *, seconds: float = 60.0, soak: bool = False, vehicles: int = 5, imu: int = 200, json: bool = False
+) -> None:
+    """The live pipeline under load, in one and in three processes: losses, age of the estimates, CPU and memory.
+
+    Real processes, sockets and bus; a sender takes a part of a core. Ages mean little on a machine that does other
+    work.
+
+    Parameters
+    ----------
+    seconds
+        For each of six runs: 1, 5 and 20 thousand messages per second.
+    soak
+        One run in three processes instead, 600 s if --seconds is not given, with what the sensors say and nothing
+        beside.
+    vehicles
+        Of the soak.
+    imu
+        Inertial samples per second of each vehicle of the soak, a divisor of 400.
+    json
+        Print JSON instead of tables.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from sims.experiments.pipeline_speed import compare, run
+
+    if soak:
+        found = run(vehicles, imu, 600.0 if seconds == 60.0 else seconds, say)
+    else:
+        found = compare(seconds=seconds, tell=say)
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+    else:
+        console = Console(highlight=False, width=max(Console().width, 160))
+        for what, value in found.machine.items():
+            console.print(f"{what}: {value}", markup=False)
+        for table in found.tables():
+            console.print(table)
+    if soak and (faults := found.rows[0].faults):
+        raise Failure(f"the soak did not pass: {', '.join(faults)}")
+
+
 BENCHMARKS: dict[str, Callable[..., None]] = {
     "smooth": smooth,
     "decode": decode,
+    "pipeline": pipeline,
     "linear": linear,
     "extended": extended,
     "long": long,

@@ -78,11 +78,11 @@ class _Stages:
         self.check()
 
 
-def stop_on_signals(stop: Callable[[], None]) -> None:
+def stop_on_signals(stop: Callable[[], None], what: str = "the window, the recording and the raw log") -> None:
     """The first Ctrl-C or SIGTERM ends the input, so that everything closes in order; the second kills."""
 
     def handle(*_: object) -> None:
-        say("closing: the window, the recording and the raw log (again to abandon)")
+        say(f"closing: {what} (again to abandon)")
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         stop()
@@ -165,10 +165,10 @@ class Reception:
             if self.raw_log.size:
                 self.since = self.raw_log.reached
                 past = open_log(folder, configuration, size=self.raw_log.size).source.batches()
-            if not resume:
-                write_what_runs(folder, name, endpoints, forward, configuration, self.dialect)
             self.source = Receiver(endpoints, self.dialect, self.raw_log, forward=forward, guard=guard)
             self._past = past
+            if not resume:
+                write_what_runs(folder, name, endpoints, forward, configuration, self.dialect)
             for trouble in (self.raw_log.error, self.raw_log.warning, *self.raw_log.notes):
                 if trouble:  # nobody hears of it on the bus before something is received
                     say(f"warning: {trouble}")

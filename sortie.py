@@ -6,8 +6,10 @@ that reads the command line, so that ``sortie --help`` answers at once.
 
 from __future__ import annotations
 
+import atexit
 import inspect
 import json
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -251,7 +253,7 @@ def router(*, listen: list[str], credentials: Path | None = None, zenohd: bool =
         print(router_file(listen, credentials), end="")
         return
     stop = threading.Event()
-    stop_on_signals(stop.set)
+    stop_on_signals(stop.set, "the bus")
     serve_router(listen, credentials, stop=stop, ready=lambda: say(f"carrying the bus on {', '.join(listen)}"))
 
 
@@ -723,10 +725,22 @@ def _application() -> Any:
 
 def main() -> None:
     """Run the command line: exit code 0 when the work is done, 1 when it failed, 2 when it was asked for wrongly."""
-    arguments = sys.argv[1:]
+    code = _run(sys.argv[1:])
+    if "zenoh" in sys.modules:
+        # Its threads may be about to ask for the interpreter, and one that goes meanwhile takes the process with it
+        # (SIGABRT, after the work is done). Everything of ours is closed by now.
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    if code:
+        sys.exit(code)
+
+
+def _run(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("--help", "-h"):
         print(_overview())
-        return
+        return 0
     debug = "--debug" in arguments
     from cyclopts import CycloptsError
 
@@ -734,15 +748,16 @@ def main() -> None:
         _application()([a for a in arguments if a != "--debug"], exit_on_error=False, print_error=False)
     except CycloptsError as error:
         say(f"sortie: {' '.join(str(error).split())} (see sortie --help)")
-        sys.exit(2)
+        return 2
     except KeyboardInterrupt:
         say("sortie: interrupted")
-        sys.exit(1)
+        return 1
     except (Failure, OSError, ValueError) as error:
         if debug:
             raise
         say(f"sortie: {_line(error)}")
-        sys.exit(1)
+        return 1
+    return 0
 
 
 def _line(error: Exception) -> str:

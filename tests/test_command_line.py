@@ -7,11 +7,14 @@ import socket
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import sims
+from telemetry.mavlink import Dialect
+from telemetry.sources.tlog import TlogSource
 from tests.console import RERUN, Process, free_port, run
 from tests.telemetry.wire import DATA, Sender, tlog
 
@@ -222,7 +225,7 @@ def test_wrong_usage_is_exit_code_two(arguments, words):
     ("arguments", "words"),
     [
         (["live"], "say where telemetry comes from"),
-        (["live", "tcp:1"], "'tcp:1' is no endpoint"),
+        (["live", "morse:1"], "'morse:1' is no endpoint"),
         (["sim", "zeppelin", "--to", "udpout:14550"], "zeppelin"),
         (["review", "none.rrd"], "none.rrd: no such recording"),
         (["verify", "."], "is no sortie folder"),
@@ -325,3 +328,69 @@ def test_bench_says_where_the_time_goes(log):
     assert done.returncode == 0, done.stderr
     told = [line.split()[0] for line in done.stdout.splitlines()[1:]]
     assert told == ["read", "decode", "estimate", "write", "all", "overlapped"]
+
+
+def test_a_port_in_use_would_stop_a_flight(tmp_path):
+    port = free_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", port))
+        done = run("doctor", f"udpin:127.0.0.1:{port}", "--folder", tmp_path, "--json")
+    assert done.returncode == 1
+    found = {one["what"]: one for one in json.loads(done.stdout)}
+    assert "in use" in found[f"udpin:127.0.0.1:{port}"]["text"]
+    assert f"1 thing would stop a flight: udpin:127.0.0.1:{port}" in done.stderr
+
+
+def test_keys_are_made_once_and_never_overwritten(tmp_path):
+    done = run("keys", tmp_path / "keys", "--host", "10.0.0.1")
+    assert done.returncode == 0, done.stderr
+    made = {Path(path).name for path in done.stdout.split()}
+    assert {"ca.pem", "ca.key", "router.key", "ingest.pem"} <= made
+    again = run("keys", tmp_path / "keys")
+    assert again.returncode == 1
+    assert one_line(again)
+
+
+def test_a_bus_off_this_machine_needs_certificates(tmp_path):
+    done = run("router", "--listen", "tcp/10.0.0.1:7447")
+    assert done.returncode == 1
+    assert "sortie keys FOLDER --host 10.0.0.1" in one_line(done)
+    assert run("keys", tmp_path / "keys").returncode == 0
+    printed = run("router", "--listen", "tls/127.0.0.1:7447", "--credentials", tmp_path / "keys", "--zenohd")
+    told = json.loads(printed.stdout)
+    assert told["access_control"]["default_permission"] == "deny"
+    assert told["transport"]["link"]["tls"]["enable_mtls"] is True
+
+
+def test_a_sortie_is_resumed_as_what_it_was(tmp_path):
+    port = free_port()
+    flight = sims.fly("c172x", "straight", duration=20)
+    for resume, count in (((), 1), (("--resume",), 2)):
+        told = ("--sortie", "s", "--folder", tmp_path / "s", "--idle", 1.5, *resume)
+        with Process("live", f"udpin:127.0.0.1:{port}", *told) as live:
+            live.wait_for("listening")
+            sims.send(sims.frames(flight), f"udpout:127.0.0.1:{port}", speed=20)
+            assert live.end() == 0, live.said
+        assert len(list((tmp_path / "s").glob("*.rrd"))) == 2
+        source = TlogSource(tmp_path / "s", Dialect(), trusted=True)
+        assert sum(len(batch) for batch in source.batches()) == count * len(list(sims.frames(flight)))
+    wrong = run("live", "--sortie", "other", "--folder", tmp_path / "s", "--resume")
+    assert "resume it with --sortie s" in one_line(wrong)
+    assert run("verify", tmp_path / "s").returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [("copter_dronekit_log171.bin", "hole in the log"), ("vtol_pyulog_sample_log_small.ulg", "dropped out")],
+)
+def test_logs_written_on_board_are_smoothed_too(name, what, tmp_path):
+    log = DATA / name
+    if not log.exists():
+        pytest.skip(f"{log} is not here")
+    done = run("smooth", log, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert what in done.stderr
+    summary = json.loads(run("review", tmp_path / f"{log.stem}.rrd", "--json").stdout)["summary"]
+    assert summary["windows"]
+    refused = run("replay", log, "--to", "udpout:127.0.0.1:14550")
+    assert "holds no MAVLink frames to send" in one_line(refused)
