@@ -35,6 +35,10 @@ def new_folder(
     name: str | None, folder: Path | None, *, shared: bool = False, resume: bool = False
 ) -> tuple[str, Path]:
     """Name and folder of a sortie: a new one, unless it is `shared` by several processes or resumed."""
+    if resume and not name:
+        if folder is None:
+            raise Failure("say which sortie is resumed: --sortie NAME, or --folder FOLDER")
+        name = read_what_ran(folder).sortie
     name = name or datetime.now(UTC).strftime("sortie-%Y%m%d-%H%M%S")
     folder = folder or Path("sorties") / name
     if not (shared or resume) and folder.exists() and any(folder.iterdir()):
