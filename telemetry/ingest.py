@@ -24,7 +24,7 @@ from telemetry import text
 from telemetry.boottimes import AUTOPILOT, UNIX_US, BootTimes
 from telemetry.frames import Frames, scan_datagrams
 from telemetry.heard import Heard
-from telemetry.link import LinkAccounts
+from telemetry.link import SENDERS, LinkAccounts
 from telemetry.mavlink import Dialect
 from telemetry.messages import Event, LinkBytes, Message, Progress, event
 from telemetry.redundant import Copies
@@ -212,6 +212,7 @@ class Ingest:
         self.accounts = LinkAccounts()
         self._bytes = np.zeros((len(links), 7), np.int64)
         self._bytes_told = 0
+        self._unfollowed = 1  # frames of senders without an account that are worth telling
         self._pending = 0
         self._reached = 0  # receive time of everything told so far
         self._received = 0  # receive time of the newest frame
@@ -307,6 +308,11 @@ class Ingest:
             else:
                 self.accounts.advance(self._reached)
             yield from self.accounts.drain(self._links, lambda _: 0)
+            if self.accounts.unfollowed >= self._unfollowed:
+                count = self.accounts.unfollowed
+                self._unfollowed = 10 ** len(str(count))
+                words = f"ALARM: {count} frames of senders beyond the first {SENDERS}: what these lost is not counted"
+                yield event(words, level="error", source=STAGE, t=self._reached, t_rx=self._reached)
             if final or self._reached - self._bytes_told >= BYTES_ROW:
                 self._bytes_told = self._reached
                 for link in np.flatnonzero(self._bytes[:, _BYTES]).tolist():

@@ -168,11 +168,21 @@ class LossAccount:
         return bool(self._counts)
 
 
+SENDERS = 1024  # followed at once: what invents more of them must not use up memory and time
+
+
 class LinkAccounts:
-    """The accounts of all senders on all links, fed with whole batches of frames."""
+    """The accounts of all senders on all links, fed with whole batches of frames.
+
+    Attributes
+    ----------
+    unfollowed : int
+        Frames of senders beyond the first 1024, which have no account.
+    """
 
     def __init__(self) -> None:
         self._accounts: dict[tuple[int, int, int], LossAccount] = {}
+        self.unfollowed = 0
 
     def __getitem__(self, key: tuple[int, int, int]) -> LossAccount:
         """The account of (link, system, component)."""
@@ -197,6 +207,9 @@ class LinkAccounts:
         for key in present:
             name = key >> 16, key >> 8 & 255, key & 255
             if name not in self._accounts:
+                if len(self._accounts) >= SENDERS:
+                    self.unfollowed += int(np.count_nonzero(keys == key))
+                    continue
                 self._accounts[name] = LossAccount()
             if len(present) == 1:
                 self._accounts[name].feed(seq, t_rx, digest, marks, told)

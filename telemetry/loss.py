@@ -59,7 +59,7 @@ UNSEEN, ARRIVED, HOLE, GONE, KEPT = range(5)  # the fates; KEPT: in the held jum
 def _settle(a, fate, turning):  # type: ignore[no-untyped-def]
     """Count the held jump as lost; with ``turning``, the turns of the counter that the rate before it asks for too."""
     missing = a[HELD]
-    if turning:
+    if turning and a[JUMP_TIME] > 0:
         rate, after = a[JUMP_NUMBERS] / a[JUMP_TIME], a[SPOKEN] - a[JUMP]
         if after >= SECOND:  # a sender that has slowed down has sent fewer than its old rate says
             rate = min(rate, (a[HIGHEST] - a[JUMP_NUMBER]) / after)

@@ -42,7 +42,7 @@ UNIT = 10_000  # ns
 SIGNATURE = 13
 SIGNED = 1  # incompatibility flag
 RADIO, RADIO_COMPONENT, RADIO_STATUS = 51, 68, 109
-COPIES = 256  # frames of each sender whose copies over other links are still known
+COPIES = 4096  # frames of each sender whose copies over other links are still known
 SAVE = 5.0  # s
 LONGEST_KEY_FILE = 4096
 TITLE = "times of MAVLink signatures, 10 us since 2015"
@@ -157,6 +157,8 @@ class SignatureGuard:
         self._seen = seen
         self._last = _load(seen) if seen is not None and seen.exists() else {}
         self._copies: dict[tuple[int, int, int], OrderedDict[int, tuple[bytes, int]]] = {}
+        self._floor: dict[tuple[int, int, int], int] = {}  # up to here it is not known what has passed
+        self._over: dict[tuple[int, int, int, int], int] = {}  # newest time that each link has brought
         self._changed = False
         self._saved = time.monotonic()
 
@@ -213,11 +215,14 @@ class SignatureGuard:
         sender = (frame[5], frame[6], frame[-SIGNATURE])
         copies = self._copies.get(sender)
         bit = 1 << link
-        if signed <= self._last.get(sender, now - self._behind):
-            known, links = copies.get(signed, (b"", 0)) if copies else (b"", 0)
-            if copies is None or known != signature or links & bit:
+        last = self._last.get(sender, now - self._behind)
+        if signed <= last:  # a copy, or what the other links lost: over this link the times still run forward
+            known, links = copies.get(signed, (signature, 0)) if copies else (b"", 0)
+            if not copies or known != signature or links & bit or signed <= self._over.get((*sender, link), -1):
                 return "replay"
-            copies[signed] = signature, links | bit
+            if not links and signed <= self._floor[sender]:
+                return "replay"
+            self._remember(copies, sender, link, signed, signature)
             return "ok"
         if signed > now + self._ahead:
             return "future"
@@ -226,10 +231,22 @@ class SignatureGuard:
         self._changed = True
         if copies is None:
             copies = self._copies[sender] = OrderedDict()
-        copies[signed] = signature, bit
-        if len(copies) > COPIES:
-            copies.popitem(last=False)
+            self._floor[sender] = last
+        self._remember(copies, sender, link, signed, signature)
         return "ok"
+
+    def _remember(
+        self,
+        copies: OrderedDict[int, tuple[bytes, int]],
+        sender: tuple[int, int, int],
+        link: int,
+        signed: int,
+        signature: bytes,
+    ) -> None:
+        copies[signed] = signature, copies.get(signed, (b"", 0))[1] | 1 << link
+        self._over[(*sender, link)] = signed
+        if len(copies) > COPIES:  # what is older cannot be told from a replay any more
+            self._floor[sender] = max(self._floor[sender], copies.popitem(last=False)[0])
 
 
 def _from_radio(frame: bytes) -> bool:

@@ -70,6 +70,9 @@ class Instruments(Protocol):
         """What is left to say at the end."""
 
 
+COMPONENTS = 32  # of one system that are told: what invents more must not become a flood of events
+
+
 class System:
     """What one system id says.
 
@@ -219,7 +222,7 @@ class System:
         own = frames.sysid[rows] == self._sysid
         for row in rows[own & (ids == HEARTBEAT)].tolist():
             compid = int(frames.compid[row])
-            if compid not in self._seen:
+            if compid not in self._seen and len(self._seen) < COMPONENTS:
                 self._seen.add(compid)
                 (heartbeat,) = self._dialect.decode(frames, HEARTBEAT, np.array([row]))
                 said = f"system {self._sysid} component {compid}: {_describe(heartbeat)}"

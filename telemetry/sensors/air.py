@@ -120,6 +120,14 @@ def _some(name: str) -> Doubt:
     return Doubt("its differential pressure has only been 0 (there is no sensor)", lambda values: values[name] != 0, 1)
 
 
+FLOWN = 25.0  # Pa, an airspeed of 6.4 m/s: a port to which nothing is connected drifts by less
+
+
+def _flown(name: str) -> Doubt:
+    reason = f"its differential pressure has not yet been {FLOWN:.0f} Pa in 5 rows running (no probe, or at rest)"
+    return Doubt(reason, lambda values: np.asarray(number(values, name, 100.0) > FLOWN), 5)
+
+
 def _differs(values: NDArray[Any]) -> Mask:
     with np.errstate(invalid="ignore"):
         return np.asarray(np.abs(number(values, "airspeed") - number(values, "groundspeed")) > COPY)
@@ -156,8 +164,8 @@ AIR_FEEDS = (
     Feed("HIL_SENSOR", 107, AirData, 1, _highres_air, _SIMULATED, "id", _PITOT, _some("diff_pressure"), sent_to=True),
     Feed("AIRSPEED", 295, AirData, 2, _airspeed, "the sensor as the autopilot corrects it", "id"),
     Feed("VFR_HUD", 74, AirData, 3, _hud_airspeed, _HUD, doubt=COPIED),
-    Feed("SCALED_PRESSURE", 29, AirData, 4, _scaled_air, _UNCORRECTED, 0, doubt=_some("press_diff")),
-    Feed("SCALED_PRESSURE2", 137, AirData, 4, _scaled_air, _UNCORRECTED, 1, doubt=_some("press_diff")),
-    Feed("SCALED_PRESSURE3", 143, AirData, 4, _scaled_air, _UNCORRECTED, 2, doubt=_some("press_diff")),
+    Feed("SCALED_PRESSURE", 29, AirData, 4, _scaled_air, _UNCORRECTED, 0, doubt=_flown("press_diff")),
+    Feed("SCALED_PRESSURE2", 137, AirData, 4, _scaled_air, _UNCORRECTED, 1, doubt=_flown("press_diff")),
+    Feed("SCALED_PRESSURE3", 143, AirData, 4, _scaled_air, _UNCORRECTED, 2, doubt=_flown("press_diff")),
     Feed("AOA_SSA", 11020, FlowAngles, 0, _aoa_ssa, "from no ArduPilot, so of vanes", derived=True),
 )

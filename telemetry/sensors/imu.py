@@ -90,9 +90,9 @@ IMU_FEEDS = (
     Feed("HIGHRES_IMU", 105, Imu, 0, _highres_imu, "closest to the instrument", "id", (INERTIAL,)),
     Feed("HIL_SENSOR", 107, Imu, 1, _highres_imu, "the sensors of a simulator", "id", (INERTIAL,), sent_to=True),
     Feed("SCALED_IMU", 26, Imu, 2, _scaled_imu, "in steps of 1 mg and 1 mrad/s", 0),
-    Feed("SCALED_IMU2", 116, Imu, 2, _scaled_imu, "in steps of 1 mg and 1 mrad/s", 1),
-    Feed("SCALED_IMU3", 129, Imu, 2, _scaled_imu, "in steps of 1 mg and 1 mrad/s", 2),
     Feed("RAW_IMU", 27, Imu, 3, _scaled_imu, "its units are mg and mrad/s, by its weight at rest", "id", doubt=COUNTS),
+    Feed("SCALED_IMU2", 116, Imu, 3, _scaled_imu, "in steps of 1 mg and 1 mrad/s", 1),
+    Feed("SCALED_IMU3", 129, Imu, 3, _scaled_imu, "in steps of 1 mg and 1 mrad/s", 2),
     Feed("ATTITUDE", 30, Attitude, 0, _attitude, "as the autopilot estimates it"),
     Feed("ATTITUDE_QUATERNION", 31, Attitude, 1, _attitude_quaternion, "as the autopilot estimates it"),
 )

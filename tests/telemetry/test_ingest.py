@@ -533,3 +533,12 @@ def test_boots_of_the_real_logs(name, boots, words):
     assert any(words in text for text in texts(messages))
     fits = told(messages, ClockFit)
     assert {reference for m in fits for reference in m.reference} == {"arrival", "system_time"}
+
+
+def test_invented_senders_use_up_neither_memory_nor_time():
+    frames = [Sender(sysid, compid).heartbeat() for sysid in range(1, 41) for compid in range(1, 101)]
+    messages = run([scan(*frames)])
+    assert len({(m.vehicle, m.source) for m in told(messages, LinkStats)}) == 1024
+    said = texts(messages)
+    assert any("frames of senders beyond the first 1024" in text for text in said)
+    assert sum(" component " in text for text in said) <= 40 * 32

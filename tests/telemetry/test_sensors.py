@@ -197,17 +197,23 @@ def test_static_pressure_is_hectopascal_on_the_wire():
 
 
 def test_negative_differential_pressure_keeps_its_sign():
-    for message in (highres(bits=0x400, diff_pressure=-0.5), pressure(diff=-0.5)):
-        air = samples(message)[AirData]
-        assert air.differential_pressure[0] == -50
-        assert air.airspeed[0] == pytest.approx(-math.sqrt(2 * 50 / 1.225), rel=1e-3)  # incompressible
-
-
-def test_a_differential_pressure_that_has_only_been_zero_is_no_airspeed_system():
+    flown = [pressure(ms=i, diff=1.0) for i in range(1, 6)]
     vehicle = Vehicle()
-    found = vehicle.hear(*[pressure(ms=i, diff=diff) for i, diff in enumerate([0, 0, 0.25, 0, 0.5], 1)])
-    (air,) = [m for m in found if isinstance(m, AirData)]
-    assert air.differential_pressure.tolist() == [25, 0, 50], "once it has spoken, zero is a pressure"
+    found = [samples(highres(bits=0x400, diff_pressure=-0.5))[AirData]]
+    found += [m for m in vehicle.hear(*flown, pressure(ms=6, diff=-0.5)) if isinstance(m, AirData)]
+    for air in found:
+        assert air.differential_pressure[-1] == -50
+        assert air.airspeed[-1] == pytest.approx(-math.sqrt(2 * 50 / 1.225), rel=1e-3)  # incompressible
+
+
+def test_a_differential_pressure_that_no_flight_has_made_is_no_airspeed_system():
+    vehicle = Vehicle()
+    drift = [0, 0, 0.25, -0.2, 0.05, 1.0, 1.0, 1.0, 1.0, 0.1]  # an open port drifts, a gust is no flight
+    found = vehicle.hear(*[pressure(ms=i, diff=d) for i, d in enumerate(drift, 1)])
+    assert not [m for m in found if isinstance(m, AirData)]
+    flown = vehicle.hear(*[pressure(ms=i, diff=d) for i, d in enumerate([1.0, 1.0, 1.0, 1.0, 1.0, 0.0], 20)])
+    (air,) = [m for m in flown if isinstance(m, AirData)]
+    assert air.differential_pressure[-1] == 0, "once it has flown, zero is a pressure"
     assert not [m for m in Vehicle().hear(highres(bits=0x400), highres(bits=0x400, us=2)) if isinstance(m, AirData)]
 
 
