@@ -5,6 +5,7 @@ Nothing heavy is imported before it is needed.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -92,7 +93,12 @@ def write_what_runs(
         "dialect": {"name": dialect.name, "sha256": dialect.digest},
         "settings": msgspec.to_builtins(configuration),
     }
-    (folder / "sortie.toml").write_bytes(msgspec.toml.encode(_told(what)))
+    path, beside = folder / "sortie.toml", folder / "sortie.toml.new"
+    with beside.open("wb") as file:  # without it the raw log does not tell how many links it has
+        file.write(msgspec.toml.encode(_told(what)))
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)
 
 
 def _told(value: Any) -> Any:
@@ -123,9 +129,13 @@ def read_what_ran(folder: Path) -> Ran:
     path = folder / "sortie.toml"
     if not path.is_file():
         raise Failure(f"{folder} is no sortie folder: it has no sortie.toml")
+    kind = type(configure(None))
+    told = msgspec.defstruct(
+        "Told", [("sortie", str), ("endpoints", list[str]), ("settings", kind), ("forward", list[str], [])]
+    )
     try:
-        ran = msgspec.toml.decode(path.read_bytes())
-        settings = msgspec.convert(ran["settings"], type(configure(None)))
-        return Ran(ran["sortie"], ran["endpoints"], ran.get("forward", []), settings)
-    except (ValueError, KeyError) as error:
-        raise Failure(f"{path} is damaged: {error}") from None
+        ran: Any = msgspec.toml.decode(path.read_bytes(), type=told)
+    except ValueError as error:
+        evidence = f"the evidence is whole all the same: sortie smooth {folder / 'raw.tlog'}"
+        raise Failure(f"{path} is damaged: {error}; {evidence}") from None
+    return Ran(ran.sortie, ran.endpoints, ran.forward, ran.settings)

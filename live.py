@@ -14,10 +14,12 @@ A sortie folder::
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -223,9 +225,18 @@ def _guard(signing_key: Path | None, accept_unsigned: bool) -> Any:
 
 
 def record_folder(
-    messages: Iterable[Message], folder: Path, name: str, properties: dict[str, str], *, again: bool = False
+    messages: Iterable[Message],
+    folder: Path,
+    name: str,
+    properties: dict[str, str],
+    *,
+    finished: Callable[[], bool],
+    again: bool = False,
 ) -> Summary:
-    """Record what comes over the bus into a sortie folder; `again` in place of a recording that it makes void."""
+    """Record what comes over the bus into a sortie folder; `again` in place of a recording that it makes void.
+
+    `finished` tells in the end whether all stages have said their last.
+    """
     import msgspec
 
     from viewer.recorder import record
@@ -240,6 +251,7 @@ def record_folder(
         windows=windows,
         sortie=name,
         properties=properties,
+        completeness=lambda: "complete" if finished() else "broken off: the stages had not said their last",
         interval=0.25,  # every chunk costs a kilobyte, and a viewer shows no more than this
         on_alarm=lambda text: say(f"ALARM: {text}"),
     )
@@ -264,10 +276,27 @@ def record_lives(
         None when there was nothing to record.
     """
     summary = None
-    for life in subscription.lives():
-        messages = through(message for message in life if message is not None)
-        summary = record_folder(messages, folder, name, properties, again=resume or summary is not None)
+    with only_recorder(folder):
+        for life in subscription.lives():
+            messages = through(message for message in life if message is not None)
+            again = resume or summary is not None
+            done = lambda: subscription.finished and not subscription.missing  # noqa: E731
+            summary = record_folder(messages, folder, name, properties, finished=done, again=again)
     return summary
+
+
+@contextmanager
+def only_recorder(folder: Path) -> Iterator[None]:
+    """Keep a second process from recording into the same folder."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise Failure(f"{folder}: another process is recording there; end it first") from None
+        yield
+    finally:
+        os.close(handle)
 
 
 def follow(
@@ -323,7 +352,9 @@ def follow(
             try:
                 told = watch(received(), tell, since=reception.since)
                 properties = {"endpoints": " ".join(reception.endpoints)}
-                summary = record_folder(told, folder, name, properties, again=again)
+                with only_recorder(folder):
+                    whole = lambda: subscription.finished and not subscription.missing  # noqa: E731
+                    summary = record_folder(told, folder, name, properties, finished=whole, again=again)
                 stages.check()
             except Exception as error:  # what else may be broken, the evidence of the flight is not given up
                 tell(f"ALARM: {error or type(error).__name__}: only the raw log goes on; Ctrl-C ends it")

@@ -167,7 +167,8 @@ def ingest(
             say(f"{name}: listening on {', '.join(reception.endpoints)}, bus on {bus_at}")
             messages = watch(reception.messages(receive.idle), say, since=reception.since)
             drained = publish(bus, "ingest", messages)
-            bus.linger()  # the others still talk to one another over the bus that is carried here
+            if not connect:
+                bus.linger()  # the others still talk to one another over the bus that is carried here
             if not drained:
                 raise Failure("a consumer on the bus had not processed everything in time; the raw log is whole")
         finally:
@@ -187,7 +188,7 @@ def estimate(*, sortie: str, connect: str = BUS, credentials: Path | None = None
     credentials
         Folder of certificates, for a bus that leaves this machine.
     config
-        TOML file with settings.
+        TOML file with settings, the one that sortie ingest has: sortie verify goes by that.
     """
     import estimator.stage
     from telemetry.bus import Bus, serve
@@ -198,6 +199,7 @@ def estimate(*, sortie: str, connect: str = BUS, credentials: Path | None = None
     def stage(messages: Iterable[Message]) -> Iterator[Message]:
         return estimator.stage.estimate(watch(messages, say, every=False), configuration.estimate)
 
+    say(f"{sortie}: waiting for the bus on {connect}")
     with Bus(sortie, connect=[connect], credentials=credentials, role="estimate") as bus:
         say(f"{sortie}: estimating on {connect}")
         started = lambda subscription: stop_on_signals(subscription.stop)  # noqa: E731
@@ -226,13 +228,16 @@ def record(
     from telemetry.bus import Bus
 
     name, folder = new_folder(sortie, folder, shared=True)
+    say(f"{name}: waiting for the bus on {connect}")
     with Bus(name, connect=[connect], credentials=credentials, role="record") as bus:
         subscription = bus.subscribe("record", ["ingest", "estimate"], health=True)
         say(f"{name}: recording from {connect} into {folder}")
         stop_on_signals(subscription.stop)
         told = partial(watch, tell=say)
-        record_lives(subscription, folder, name, {"bus": connect}, through=told, resume=resume)
+        summary = record_lives(subscription, folder, name, {"bus": connect}, through=told, resume=resume)
         subscription.close()
+    if summary is None or not summary.vehicles:
+        raise Failure(f"nothing was heard of sortie {name} on {connect}")
 
 
 def router(*, listen: list[str], credentials: Path | None = None, zenohd: bool = False) -> None:
@@ -483,7 +488,9 @@ def verify(folder: Path) -> None:
     for difference in differences:
         print(difference)
     if differences:
-        raise Failure(f"{folder}: the recording and the replay of its raw log differ in {len(differences)} places")
+        why = "if sortie estimate ran with another --config than sortie ingest, that is why"
+        places = counted(len(differences), "place")
+        raise Failure(f"{folder}: the recording and the replay of its raw log differ in {places}; {why}")
     if not counts["estimates"]:
         raise Failure(f"{folder}: nothing was estimated, so nothing could be compared")
     print(f"{folder}: live equals replay, bit for bit: {counts['estimates']} estimates, {counts['windows']} windows")

@@ -345,8 +345,17 @@ def _available_memory() -> float:
 def _bus(connect: Sequence[str], credentials: Path | None, role: str | None) -> Iterator[Finding]:
     import threading
 
+    from telemetry import keys
     from telemetry.bus import session
 
+    if credentials is not None:
+        for role_there in sorted(path.stem for path in credentials.glob("*.pem") if path.stem != "ca"):
+            certificate = f"certificate of {role_there}"
+            if (why := keys.problem(credentials, role_there)) is not None:
+                yield Finding("error", certificate, why)
+            else:
+                soon = keys.warning(credentials, role_there)
+                yield Finding("warning" if soon else "ok", certificate, soon or "is good")
     what = f"bus on {', '.join(connect)}" if connect else "bus"
     try:
         bus = session.Bus("doctor", connect=connect, wait=2.0, credentials=credentials, role=role)
@@ -354,6 +363,10 @@ def _bus(connect: Sequence[str], credentials: Path | None, role: str | None) -> 
         yield Finding("error", what, str(error))
         return
     came = threading.Event()
+    if connect:
+        bus.close()
+        yield Finding("ok", what, f"the router lets in {role or 'us'}")
+        return
     with bus:
         key = f"{bus.root}/{os.getpid()}"
         subscriber: Any = bus.session.declare_subscriber(key, lambda _: came.set())

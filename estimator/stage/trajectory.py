@@ -107,8 +107,12 @@ class Leg:
         at = np.flatnonzero(rows.sensor == ALTITUDE)
         if len(at):
             z[at], r[at] = model.altimeter(rows.z[at, HEIGHT_COLUMN], rows.r[at, HEIGHT_COLUMN])
-        # The others make no steps, but time passes with them: an altitude does not wait for the next one.
-        self._synchroniser.push(rows._replace(z=z, r=r))
+        # With a lag that adapts time passes with the others too, which make no steps: an altitude does not wait for the
+        # next one.
+        rows = rows._replace(z=z, r=r)
+        if self._settings.least_lag is None:  # they wait for each other alone, whatever else has come
+            rows = take(rows, rows.sensor < len(USED))
+        self._synchroniser.push(rows)
         self.watermark = self._synchroniser.watermark.copy()
         yield from self._release(until, False)
 

@@ -27,8 +27,8 @@ BURST = 0.002
 """Between two looks at the clock (s)."""
 HEAD = 10
 """Bytes of a MAVLink 2 frame before its payload."""
-STAGGER = 1_300_000
-"""By how much each vehicle speaks after the one before (ns): they share no clock."""
+STAGGER = 4_300_000_000
+"""By how much each vehicle takes off after the one before (ns): their windows do not all close at once."""
 
 
 class Load(msgspec.Struct, frozen=True, kw_only=True):

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Processes = Literal[1, 3]
 Tell = Callable[[str], None]
 
-SETTLE = 15.0  # s
+SETTLE = 30.0  # s
 AGE = 0.05  # s: the target for the 99th percentile
 GROWTH = 0.05  # share of its memory by which a process may grow per minute and still be called flat
 LAG = 0.005  # s that a sample waits for older ones where none is late

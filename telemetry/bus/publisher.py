@@ -10,6 +10,7 @@ import zenoh
 
 from telemetry.bus.ancestry import Lineage, new_instance, write_lineage
 from telemetry.bus.feed import LARGEST
+from telemetry.bus.security import ONLOOKER
 from telemetry.bus.spool import Spool
 from telemetry.messages import Message, event
 from telemetry.wire import encode, schema
@@ -157,7 +158,7 @@ class Publisher:
                 self._listening.add(str(sample.key_expr).split("/")[-2])
         while (sample := self._leaving.try_recv()) is not None:
             self._listening.discard(str(sample.key_expr).split("/")[-2])
-        listening |= self._listening
+        listening = (listening | self._listening) - {ONLOOKER}
         if not listening or self.sequence == 0:
             return True
         done: dict[str, int] = {}

@@ -97,6 +97,8 @@ class Subscription:
         Payloads that were no message of this version.
     missing : int
         Messages given up.
+    finished : bool
+        Whether all stages have said their last.
     backfilled : int
         Messages that came from the history of their stage: all that was said before this consumer came, and what was
         lost on the way.
@@ -108,6 +110,7 @@ class Subscription:
         self._bus = bus
         self._service = bus.chunk(service)
         self._health = health
+        self.finished = False
         self._stopping = threading.Event()
         self._past = [0, 0, 0]  # missing, refused, backfilled of the lives before
         self._strays = 0  # payloads of no stage's numbering
@@ -226,6 +229,7 @@ class Subscription:
                 feed.findings.clear()
                 yield from self._watch(one)
             if all(one.run[1].final for one in self._inputs):
+                self.finished = True
                 self._leave()
                 self._rest()
                 return
@@ -258,7 +262,10 @@ class Subscription:
         for one in self._inputs:
             while (sample := one.tokens.try_recv()) is not None:
                 self._tokens_changed = True
-                *_, stage, instance, lineage = str(sample.key_expr).rsplit("/", 3)
+                chunks = str(sample.key_expr).removeprefix(f"{self._bus.root}/").split("/")
+                if len(chunks) != 5 or chunks[2] != one.stage:  # a token speaks for the stage it is allowed for
+                    continue
+                *_, stage, instance, lineage = chunks
                 if sample.kind == zenoh.SampleKind.PUT:
                     self._ancestry.appear(stage, instance, lineage)
                 else:

@@ -118,6 +118,7 @@ class Receiver:
         self._vehicles = len(endpoints)
         self._resolution = 1000 << link_bits(len(self.links))  # ns: in the raw log the bits below are the link number
         self._last = raw_log.reached if raw_log else 0
+        self._resumed = self._last > 0
         self._pieces: list[_Piece] = []
         self._oldest = 0.0
         self._streams: dict[Channel, StreamScanner] = {}
@@ -174,14 +175,15 @@ class Receiver:
         Parameters
         ----------
         idle : float, optional
-            Stop by itself when nothing has arrived for so long, s, counted from the first arrival.
+            Stop by itself when nothing has arrived for so long, s, counted from the first arrival, or from now where
+            a raw log is resumed.
 
         Raises
         ------
         Exception
             What ended the receiving thread, if anything did.
         """
-        last: float | None = None
+        last = time.monotonic() if self._resumed else None
         while True:
             with self._ready:
                 if not self._queue and not self._done:
