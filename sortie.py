@@ -276,6 +276,8 @@ def keys(folder: Path, *, host: list[str] | None = None, days: float = 365.0) ->
     """
     from telemetry.keys import HOSTS, create
 
+    if not days > 0:
+        raise ValueError(f"--days {days}: more than 0 are needed")
     for path in create(folder, hosts=[*HOSTS, *(host or ())], days=days):
         print(path)
 

@@ -56,10 +56,10 @@ def create(folder: Path, names: Sequence[str] = ROLES, hosts: Sequence[str] = HO
     FileExistsError
         If one of them is there: nothing is overwritten, and nothing has been written then.
     ValueError
-        If a name or host is none, or `days` no number of days up to the authority's own.
+        If a name or host is none, or `days` more than the authority's own.
     """
-    if not 0 < days <= _AUTHORITY_DAYS:
-        raise ValueError(f"{days} days: certificates are good for more than 0 and at most {_AUTHORITY_DAYS} days")
+    if not -_AUTHORITY_DAYS <= days <= _AUTHORITY_DAYS:
+        raise ValueError(f"{days} days: certificates are good for at most {_AUTHORITY_DAYS} days")
     alternatives = [_alternative(host) for host in hosts]
     if not alternatives:
         raise ValueError("certificates need a host: the name or address at which the router is called")

@@ -127,7 +127,7 @@ def read(path: str | Path) -> list[Message]:
 
     dialect = Dialect("ardupilotmega")
     source = TlogSource(path, dialect)
-    kept = [m for m in ingest(source.batches(), source.links, dialect) if isinstance(m, KINDS)]
+    kept = [m for m in ingest(source.batches(), source.links, dialect) if isinstance(m, KINDS) and m.chosen]
     inertial: dict[tuple[int, int], int] = {}
     for message in kept:
         if isinstance(message, Imu):
@@ -279,7 +279,7 @@ def _rows(message: Sensor, keep: Mask) -> Sensor:
 
 def _joined(messages: list[Sensor]) -> Sensor:
     """All rows in one message, in order of time."""
-    first = messages[0]
+    first = msgspec.structs.replace(messages[0], t_sigma=None)  # some told their time and some did not
     names = [n for n in first.__struct_fields__ if isinstance(getattr(first, n), np.ndarray)]
     columns = {name: np.concatenate([getattr(m, name) for m in messages]) for name in names}
     order = np.argsort(columns["t"], kind="stable")

@@ -28,7 +28,7 @@ from telemetry import keys
 from telemetry.bus.feed import LARGEST
 
 STAGES = ("ingest", "estimate")
-ONLOOKER = "viewer"
+ONLOOKER = "viewer"  # is not waited for at the end of a stage
 READS = {"ingest": (), "estimate": ("ingest",), "record": STAGES, "viewer": (*STAGES, "record")}
 QUESTION = 4096  # bytes of a query
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):(?P<port>\d+)")
@@ -110,9 +110,7 @@ def _rules(role: str) -> Iterator[dict[str, Any]]:
     answered = [f"sortie/*/ack/{role}/**", *([f"sortie/*/history/{role}/**"] if writes else [])]
     heard = [f"sortie/*/{stage}/**" for stage in reads]
     asked = [f"sortie/*/history/{stage}/**" for stage in reads] + ([f"sortie/*/ack/*/{role}"] if writes else [])
-    # Who only looks on is not waited for at the end, and does not say that it listens.
-    heeded = [f"sortie/*/listening/*/{role}/*"] if role != ONLOOKER else []
-    present = [*heeded, *([f"sortie/*/alive/*/{role}/*/*"] if writes else [])]
+    present = [f"sortie/*/listening/*/{role}/**", *([f"sortie/*/alive/*/{role}/*/*"] if writes else [])]
     # Who is there is no secret among those that were let in, and only interest in it is said with wildcards.
     anybody = ["sortie/*/alive/**", "sortie/*/listening/**"]
     for flow, messages, where in (
