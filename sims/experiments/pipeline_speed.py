@@ -294,7 +294,7 @@ class _Stage:
 
     def __init__(self, name: str, ready: str, *arguments: object) -> None:
         self.name, self._ready = name, ready
-        command = [sys.executable, "-c", "import sortie; sortie.main()", name, *map(str, arguments)]
+        command = [sys.executable, "-P", "-c", "import sortie; sortie.main()", name, *map(str, arguments)]
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         self._said: list[str] = []
         self._heard = threading.Event()
