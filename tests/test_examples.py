@@ -33,10 +33,3 @@ def test_a_log_is_reconstructed():
         pytest.skip(f"no flight log at {log}")
     told = run("examples/reconstruct.py", log)
     assert "found gnss: velocity is 0.2" in told
-
-
-def test_a_bus_lets_in_who_has_a_certificate_and_nobody_else():
-    told = run("examples/secure_bus.py")
-    assert "heard 200 words of two stages" in told
-    assert "heard 0 words of the viewer who spoke for ingest" in told
-    assert told.count("refused: ") == 2

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MSGPACK = "application/msgpack"
 DRAIN = 30.0
+ONLOOKERS = 3.0  # s, for who only looks on: nobody fails because of them
 ROUND = 1 << 19  # bytes of one answer of the history
 MANY = 256  # who comes and goes, remembered until it is looked at
 LEFT = b"left"
@@ -135,6 +136,9 @@ class Publisher:
         end = time.monotonic() + deadline
         while not (done := self._bus.connected and self._processed()) and time.monotonic() < end:
             time.sleep(0.02)
+        patience = min(end, time.monotonic() + ONLOOKERS)
+        while done and not self._processed(onlookers=True) and time.monotonic() < patience:
+            time.sleep(0.02)
         self.abandon()
         return done
 
@@ -151,14 +155,14 @@ class Publisher:
             self._publishers = {}
             self._spool.close()
 
-    def _processed(self) -> bool:
+    def _processed(self, onlookers: bool = False) -> bool:
         listening = {service for _, _, service, *_ in self._bus.tokens(f"listening/*/*/{self._stage}")}
         while (sample := self._listeners.try_recv()) is not None:
             if sample.kind == zenoh.SampleKind.PUT:
                 self._listening.add(str(sample.key_expr).split("/")[-2])
         while (sample := self._leaving.try_recv()) is not None:
             self._listening.discard(str(sample.key_expr).split("/")[-2])
-        listening = (listening | self._listening) - {ONLOOKER}
+        listening = (listening | self._listening) - (set() if onlookers else {ONLOOKER})
         if not listening or self.sequence == 0:
             return True
         done: dict[str, int] = {}

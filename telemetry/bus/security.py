@@ -28,7 +28,7 @@ from telemetry import keys
 from telemetry.bus.feed import LARGEST
 
 STAGES = ("ingest", "estimate")
-ONLOOKER = "viewer"  # is not waited for at the end of a stage
+ONLOOKER = "viewer"  # is not waited for long at the end of a stage
 READS = {"ingest": (), "estimate": ("ingest",), "record": STAGES, "viewer": (*STAGES, "record")}
 QUESTION = 4096  # bytes of a query
 _ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):(?P<port>\d+)")
