@@ -21,6 +21,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -280,9 +281,14 @@ def record_lives(
         for life in subscription.lives():
             messages = through(message for message in life if message is not None)
             again = resume or summary is not None
-            done = lambda: subscription.finished and not subscription.missing  # noqa: E731
-            summary = record_folder(messages, folder, name, properties, finished=done, again=again)
+            whole = partial(_is_whole, subscription)
+            summary = record_folder(messages, folder, name, properties, finished=whole, again=again)
     return summary
+
+
+def _is_whole(subscription: Any) -> bool:
+    """Whether all that some stages said has been heard, to their last word."""
+    return bool(subscription.finished and not subscription.missing)
 
 
 @contextmanager
@@ -327,8 +333,6 @@ def follow(
     again : bool
         Put the recordings in the place of those of before.
     """
-    from functools import partial
-
     from estimator.stage import estimate
     from telemetry.bus import Bus, publish, serve
 
@@ -353,7 +357,7 @@ def follow(
                 told = watch(received(), tell, since=reception.since)
                 properties = {"endpoints": " ".join(reception.endpoints)}
                 with only_recorder(folder):
-                    whole = lambda: subscription.finished and not subscription.missing  # noqa: E731
+                    whole = partial(_is_whole, subscription)
                     summary = record_folder(told, folder, name, properties, finished=whole, again=again)
                 stages.check()
             except Exception as error:  # what else may be broken, the evidence of the flight is not given up

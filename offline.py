@@ -134,7 +134,7 @@ def open_log(
     on_progress: Callable[[int], None] | None = None,
     *,
     size: int | None = None,
-    flight: bool = False,
+    framed: bool = False,
 ) -> Log:
     """Open a telemetry log, an on-board log, or a sortie folder with the settings of what ran there.
 
@@ -146,7 +146,7 @@ def open_log(
         Given the number of bytes read so far.
     size : int, optional
         Read so many bytes only.
-    flight : bool
+    framed : bool
         Only a log of frames will do.
     """
     from telemetry.mavlink import Dialect
@@ -164,7 +164,7 @@ def open_log(
     if what == "tlog":
         dialect = Dialect(configuration.ingest.dialect)
         return Log(TlogSource(log, dialect, on_progress=on_progress), configuration, dialect)
-    if flight:
+    if framed:
         raise Failure(f"{log} was written on board and holds no MAVLink frames to send; sortie smooth reads it")
     if what == "dataflash":
         from telemetry.sources.dataflash import DataFlashSource

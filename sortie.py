@@ -514,7 +514,7 @@ def replay(log: Path, *, to: str, speed: float = 1.0, faults: str | None = None)
     """
     import sims
 
-    batches = open_log(log, flight=True).source.batches()
+    batches = open_log(log, framed=True).source.batches()
     frames = ((int(batch.t_rx[i]), batch.frame(i)) for batch in batches for i in range(len(batch)))
     sent = sims.send(frames, to, speed=speed, faults=faults)
     print(f"{counted(sent.datagrams, 'frame')} to {to} in {sent.took:.1f} s")
