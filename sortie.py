@@ -197,7 +197,7 @@ def estimate(*, sortie: str, connect: str = BUS, credentials: Path | None = None
     estimator.stage.warm_up()
 
     def stage(messages: Iterable[Message]) -> Iterator[Message]:
-        return estimator.stage.estimate(watch(messages, say, every=False), configuration.estimate)
+        return estimator.stage.estimate(watch(messages, say, every=False), configuration.estimate, beside=True)
 
     say(f"{sortie}: waiting for the bus on {connect}")
     with Bus(sortie, connect=[connect], credentials=credentials, role="estimate") as bus:

@@ -278,6 +278,12 @@ class Stretch:
         extended.named(self.flight.model, x, q, False, mean)
         return Smoothed(mean, std, x, q, w)
 
+    def taken(self) -> Stretch:
+        """All that is known now, to be smoothed while the filter goes on here with `drop`."""
+        other = Stretch(self.flight, self.carry.copy(), window=self._window, gated=self._gated)
+        other._blocks = self._blocks
+        return other
+
     def drop(self) -> None:
         """Forget the steps: what is smoothed next begins at the present epoch."""
         self._blocks = []

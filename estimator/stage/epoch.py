@@ -9,6 +9,7 @@ import numpy as np
 from estimator.arrivals import Arrivals, Place
 from estimator.drive import WIDTH
 from estimator.models.trajectory import Trajectory
+from estimator.stage.beside import Beside
 from estimator.stage.flight import Flight
 from estimator.stage.rows import GNSS, KINDS, SENSORS, WITNESSES, rows
 from estimator.stage.settings import STAGE, Level, Reason, Scope, Settings
@@ -25,9 +26,9 @@ SLOW = (Gnss, Altitude)  # what the trajectory is made of
 class Epoch:
     """One boot epoch of one vehicle: its arrivals, and the leg that is being flown."""
 
-    def __init__(self, vehicle: int, boot: int, settings: Settings, scope: Scope) -> None:
+    def __init__(self, vehicle: int, boot: int, settings: Settings, scope: Scope, beside: Beside) -> None:
         self.heard = np.iinfo(np.int64).max  # receive time of the first message
-        self.vehicle, self.boot, self.settings, self.scope = vehicle, boot, settings, scope
+        self.vehicle, self.boot, self.settings, self.scope, self.beside = vehicle, boot, settings, scope, beside
         self._lag, self._output = round(settings.lag * 1e9), round(settings.output * 1e9)
         self._arrivals = Arrivals(SENSORS, GNSS, lag=self._lag, witnesses=WITNESSES)
         self._sieve = Sieve()

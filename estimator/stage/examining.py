@@ -56,6 +56,13 @@ class Examiner:
         self._unsorted: list[tuple[Rows, Times]] = []
         self._count = 0  # of these
 
+    def so_far(self) -> Examiner:
+        """What has been kept by now, to be asked while more is taken in here."""
+        self._sort()
+        other = Examiner(self._settings)
+        other._kept = {sensor: list(parts) for sensor, parts in self._kept.items()}
+        return other
+
     def take(self, samples: Rows, passed: Times) -> None:
         """Keep samples, in order of their arrival.
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -25,7 +26,7 @@ from estimator.drive import IMPACT, LONGEST_GAP, MEASURED, WIDTH, Driver, Sample
 from estimator.models.flight_path import FlightPath
 from estimator.stage.examining import Examiner
 from estimator.stage.passage import Closed, Passage
-from estimator.stage.report import Sum, test_point_report
+from estimator.stage.report import Known, Sum, test_point_report
 from estimator.stage.rows import AIR, GNSS, SENSORS
 from estimator.stage.settings import Level, Reason
 from estimator.stretch import Diverged, Filtered, Smoothed, Stretch
@@ -38,7 +39,8 @@ if TYPE_CHECKING:
 Times = NDArray[np.int64]
 
 S = 1_000_000_000
-ASK, RECENT = 30 * S, 180 * S  # ns between two questions for the delay of the fixes, and how far back they look
+SLOT = 5 * S  # ns of arrivals, after which a delay of the fixes that has been found is taken off
+ASK, RECENT = 6, 180 * S  # slots between two questions for the delay, and how far back they look, ns
 TRY = S // 2  # ns between two attempts to begin
 ASTRAY = "heading is no longer known to 25 deg"
 PATIENCE = 5 * S  # ns of vain attempts before the reason is told
@@ -85,7 +87,9 @@ class Flight:
         self._last = (0, 0)  # times of the newest arrival
         self.heard = -ALL  # time that was reached when the newest window closed
         self._not_before, self._pause = -ALL, PAUSE
-        self.sum = Sum()
+        self._flown = False  # whether a window has been closed
+        self.sum = Sum()  # of what has been smoothed
+        self._answer: Callable[[], float] | None = None  # the delay of the fixes, once it is found
 
     @property
     def at(self) -> tuple[int, int] | None:
@@ -117,25 +121,33 @@ class Flight:
             self._push(samples)
             yield from self._release(until, False)
             return
-        if self._slot is not None and len(samples.t) and samples.t_rx[-1] // ASK == self._slot:
+        if self._slot is not None and len(samples.t) and samples.t_rx[-1] // SLOT == self._slot:
             self._push(samples)  # in order of arrival: the others are no later
-            yield from self._release(min(until, (self._slot + 1) * ASK - 1), False)
+            yield from self._release(min(until, (self._slot + 1) * SLOT - 1), False)
             return
-        slots = samples.t_rx // ASK  # live, the delay is asked for between two of them: whatever the batches, then
+        # Live, the delay is asked for and taken off between two slots: the same ones, whatever the batches.
+        slots = samples.t_rx // SLOT
         for slot in np.unique(slots).tolist():
             if self._slot is not None and slot > self._slot:
-                yield from self._ask(slot * ASK - 1)
+                yield from self._correct(slot * SLOT - 1)
+                if slot // ASK != self._slot // ASK:
+                    self._ask()
             self._slot = slot
             self._push(take(samples, slots == slot))
-            yield from self._release(min(until, (slot + 1) * ASK - 1), False)
+            yield from self._release(min(until, (slot + 1) * SLOT - 1), False)
 
-    def _ask(self, until: int) -> Iterator[Message]:
-        """Ask the newest minutes for the delay of the satellite fixes; one that is found is taken off from here on."""
+    def _ask(self) -> None:
+        """Ask the newest minutes for the delay of the satellite fixes; the answer has time until the next slot."""
+        if not self.test_point and self._delay is None and self.examiner.fast():
+            examiner, since = self.examiner.so_far(), self._newest - RECENT
+            self._answer = self.epoch.beside.ask(lambda: examiner.delay(since))
+
+    def _correct(self, until: int) -> Iterator[Message]:
+        """Take the delay of the satellite fixes off from here on, if one has been found."""
         yield from self._release(until, False)
-        if self.test_point or self._delay is not None or not self.examiner.fast():
-            return
-        delay = self.examiner.delay(self._newest - RECENT)
-        if not delay:
+        answer, self._answer = self._answer, None
+        delay = answer() if answer is not None else 0.0
+        if not delay or self.test_point or self._delay is not None:
             return
         yield from self._release(until, True)
         why = f"satellite fixes are found to be {delay:.2f} s older than they say, which is taken off from here on"
@@ -152,8 +164,9 @@ class Flight:
             yield from self._replay()
         yield from self._release(until, True)
         yield from self._land(reason, ALL)
-        if self.sum.flight is not None:
-            yield self.sum.report(self)
+        if self._flown:
+            known = Known(self.examiner.so_far(), ALL, self.delay)
+            yield from self.epoch.beside.run(partial(self._total, known))
         elif self.examiner.fast():  # there could have been a path: perhaps a sensor is why there is none
             for finding in self.examiner.findings(-ALL, ALL, ALL, self.delay):
                 yield self.epoch.event("warning", finding, *self._last)
@@ -408,12 +421,20 @@ class Flight:
         if closed is None:
             return
         yield from passage.refused(closed)
-        self.heard = when
+        self.heard, self._flown = when, True
         if self._whole:
             return
-        smoothed = passage.stretch.smooth()
-        yield from self._tell(passage, [closed], smoothed)
+        taken, known = passage.taken(), Known(self.examiner.so_far(), when, self.delay)
         passage.forget()
+        yield from self.epoch.beside.run(partial(self._smooth, taken, closed, known))
+
+    def _smooth(self, passage: Passage, window: Closed, known: Known) -> Iterator[Message]:
+        """Smooth a window that has been taken from its passage."""
+        try:
+            yield from self._tell(passage, [window], passage.stretch.smooth(), known)
+        except (ValueError, ArithmeticError) as error:
+            text = f"window {window.number} of the flight path could not be smoothed, its estimates stand: {error}"
+            yield self.epoch.event("error", text, *Sum.last(window))
 
     def _late(self, passage: Passage, when: int) -> Rows | None:
         """Late samples that were noticed up to `when` and belong into the open window; older ones are counted."""
@@ -446,12 +467,18 @@ class Flight:
             except ArithmeticError as error:
                 text = f"iterating the smoothed flight path failed, what it was before is told: {error}"
                 yield self.epoch.event("warning", text, *passage.last)
-            yield from self._tell(passage, passage.closed, smoothed)
+            known = Known(self.examiner.so_far(), self.heard, self.delay)
+            yield from self._tell(passage, passage.closed, smoothed, known)
         self._passage = None
 
-    def _tell(self, passage: Passage, closed: list[Closed], smoothed: Smoothed) -> Iterator[Message]:
+    def _tell(self, passage: Passage, closed: list[Closed], smoothed: Smoothed, known: Known) -> Iterator[Message]:
         for window in closed:
             self.sum.add(passage, window, smoothed)
             yield passage.message(window, smoothed)
             if window.test_point:
-                yield test_point_report(self, passage, window, smoothed)
+                yield test_point_report(self.epoch, passage, window, smoothed, known)
+
+    def _total(self, known: Known) -> Iterator[Message]:
+        """What the windows add up to, once they have been smoothed."""
+        if self.sum.flight is not None:
+            yield self.sum.report(self.epoch, known)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections import Counter
 from collections.abc import Iterator
@@ -291,6 +292,14 @@ class Passage:
         self._leg.epoch.flown += 1
         self.closed.append(window)
         return window
+
+    def taken(self) -> Passage:
+        """The windows that have been closed, to be told while the filter goes on here after `forget`."""
+        other = copy.copy(self)
+        other.stretch, other.driver = self.stretch.taken(), self.driver.copy()
+        other._window = other._opening = None
+        other._log = []
+        return other
 
     def forget(self) -> None:
         """Let go of what has been told."""

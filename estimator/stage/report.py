@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from estimator import consistency
 from estimator.consistency import Tally
 from estimator.kinematics import MEASUREMENTS
 from estimator.models.flight_path import CALM, MODEL, PARAMETERS, FlightPath
-from estimator.stage.examining import EVER
+from estimator.stage.examining import EVER, Examiner
 from estimator.stage.losing import LOST, loss_effect
 from estimator.stage.losing import alone as begun
 from estimator.stage.settings import STAGE
@@ -21,7 +21,7 @@ from estimator.stretch import Smoothed
 from telemetry.messages import Channel, Parameter, Report, Spread
 
 if TYPE_CHECKING:
-    from estimator.stage.flight import Flight
+    from estimator.stage.epoch import Epoch
     from estimator.stage.passage import Closed, Passage
 
 Floats = NDArray[np.float64]
@@ -99,9 +99,27 @@ def spreads(flight: FlightPath, filtered: Floats, smoothed: Floats) -> tuple[Spr
     )
 
 
-def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: Smoothed) -> Report:
+class Known(NamedTuple):
+    """What was known when a window closed.
+
+    Attributes
+    ----------
+    examiner : Examiner
+        What the sensors had said.
+    heard : int
+        The time that had been passed by then, ns; what came after that does not count.
+    delay : float
+        Of the satellite fixes, that was taken off, s.
+    """
+
+    examiner: Examiner
+    heard: int
+    delay: float
+
+
+def test_point_report(epoch: Epoch, passage: Passage, window: Closed, smoothed: Smoothed, known: Known) -> Report:
     """Report a closed window that is a test point."""
-    flight, epoch = passage.flight, leg.epoch
+    flight, examiner, heard = passage.flight, known.examiner, known.heard
     at, t = np.concatenate(window.at), np.concatenate(window.t)
     mean, std = alone(passage, window, smoothed)
     found = parameters(flight, mean, std, epoch.found)
@@ -109,10 +127,10 @@ def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: S
         if parameter.value is not None and parameter.sigma is not None:
             epoch.found.setdefault(parameter.name, []).append((parameter.value, parameter.sigma))
     told = channels(window.tallies)
-    loss = leg.examiner.loss(int(t[0]), int(t[-1]), leg.heard)
+    loss = examiner.loss(int(t[0]), int(t[-1]), heard)
     effect = {}
     if loss is not None and loss > LOST:
-        effect = loss_effect(passage, window, smoothed, leg.examiner.due(int(t[0]), int(t[-1]), leg.heard))
+        effect = loss_effect(passage, window, smoothed, examiner.due(int(t[0]), int(t[-1]), heard))
     return Report(
         vehicle=epoch.vehicle,
         source=STAGE,
@@ -128,10 +146,10 @@ def test_point_report(leg: Flight, passage: Passage, window: Closed, smoothed: S
         parameters=found,
         channels=told,
         gaps=({"interpolated": window.bridged} if window.bridged else {})
-        | leg.examiner.silences(int(t[0]), int(t[-1]), leg.heard),
+        | examiner.silences(int(t[0]), int(t[-1]), heard),
         loss=loss,
         loss_effect=effect,
-        findings=leg.examiner.findings(int(t[0]), int(t[-1]), leg.heard, leg.delay),
+        findings=examiner.findings(int(t[0]), int(t[-1]), heard, known.delay),
         alarms=alarms(told, window.doubts, int(passage.failed)),
         digest=window.digest.hexdigest(),
     )
@@ -147,8 +165,8 @@ class Sum:
         self.smoothed: list[Floats] = []
         self.found: dict[str, tuple[float, float]] = {}  # parameters: value and sigma where they were known best
         self.doubts = 0
-        self._failed: list[Passage] = []
-        self._passage: Passage | None = None  # the newest
+        self._failed: set[int] = set()  # beginnings of the stretches that did
+        self._stretch: int | None = None  # beginning of the newest
         self.begin = 0
         self.end = (0, 0)
         self.number = 0
@@ -173,11 +191,11 @@ class Sum:
             if name in PARAMETERS and not sigma > self.found.get(name, (0.0, np.inf))[1]:
                 self.found[name] = float(value), float(sigma)
         self.doubts += window.doubts
-        if passage.failed and passage not in self._failed:
-            self._failed.append(passage)
-        if self._passage is not None and passage is not self._passage:
+        if passage.failed:
+            self._failed.add(passage.first)
+        if self._stretch is not None and passage.first != self._stretch:
             self.lost += max(passage.first - self.end[0], 0) * 1e-9
-        self._passage = passage
+        self._stretch = passage.first
         self.end = self.last(window)
         self.number = window.number
         self.bridged += window.bridged
@@ -189,17 +207,17 @@ class Sum:
         t, t_rx = np.concatenate(window.t), np.concatenate(window.t_rx)
         return int(t[-1]), int(t_rx[-1])
 
-    def report(self, leg: Flight) -> Report:
+    def report(self, epoch: Epoch, known: Known) -> Report:
         """Report the whole leg."""
         assert self.flight is not None
         told = channels(self.tallies)
         gaps = {"interpolated": self.bridged, "lost": self.lost}
-        gaps |= leg.examiner.silences(self.begin, self.end[0], EVER)
+        gaps |= known.examiner.silences(self.begin, self.end[0], EVER)
         found = np.array([self.found.get(name, (np.nan, np.nan)) for name in self.flight.names])
         return Report(
-            vehicle=leg.epoch.vehicle,
+            vehicle=epoch.vehicle,
             source=STAGE,
-            boot=leg.epoch.boot,
+            boot=epoch.boot,
             t=np.array([self.end[0]]),
             t_rx=np.array([self.end[1]]),
             model=MODEL,
@@ -211,9 +229,9 @@ class Sum:
             parameters=parameters(self.flight, found[:, 0], found[:, 1], {}),
             channels=told,
             gaps={name: seconds for name, seconds in gaps.items() if seconds},
-            loss=leg.examiner.loss(self.begin, self.end[0], EVER),
+            loss=known.examiner.loss(self.begin, self.end[0], EVER),
             loss_effect={},
-            findings=leg.examiner.findings(-EVER, EVER, EVER, leg.delay),
+            findings=known.examiner.findings(-EVER, EVER, EVER, known.delay),
             alarms=alarms(told, self.doubts, len(self._failed)),
             digest=self._digest.hexdigest(),
         )

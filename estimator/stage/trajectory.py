@@ -44,9 +44,6 @@ class _Open:
     dof: int = 0
     anchors: int = 0
 
-    def __len__(self) -> int:
-        return sum(len(t) for t in self.t)
-
 
 class Leg:
     """A stretch of an epoch that one filter flies.
@@ -145,7 +142,7 @@ class Leg:
             begin = self._window.begin
             if begin is None and i < len(t):
                 begin = int(t[measured[np.searchsorted(measured, i)]])
-            later = silences[silences >= i + (len(self._window) == 0)]
+            later = silences[silences >= i + (not self._window.t)]
             cuts: list[tuple[int, Reason]] = [(len(t), "end")]
             if len(later):
                 cuts.append((int(later[0]), "gap"))
@@ -240,7 +237,7 @@ class Leg:
 
     def _mark(self, when: int, action: str, name: str) -> Iterator[Message]:
         if action == "stop" and self._window.test_point != name:
-            t_rx = int(self._window.t_rx[-1][-1]) if len(self._window) else when
+            t_rx = int(self._window.t_rx[-1][-1]) if self._window.t else when
             yield self._epoch.event(
                 "warning", f"test point {name} stopped without having been started: ignored", when, t_rx
             )
@@ -256,7 +253,7 @@ class Leg:
     def close(self, reason: Reason, when: int) -> Iterator[Window]:
         """Close the window at time `when` (of the step or mark that closed it) and begin the next one."""
         window = self._window
-        if not len(window):
+        if not window.t:
             return
         late = Counter(USED[sensor] for t, sensor in self._late if t <= when)
         self._late = [item for item in self._late if item[0] > when]

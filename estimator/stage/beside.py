@@ -1,0 +1,63 @@
+"""Work beside the flight: windows are smoothed and judged while the filter flies on.
+
+What a job says depends on nothing that changes after it was given, so it is the same whenever it is done; only its
+place among the other messages is not.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from telemetry.messages import Message
+
+T = TypeVar("T")
+Job = Callable[[], Iterable[Message]]
+
+BACKLOG = 16  # jobs that may wait: beyond that the flight waits for them, and memory stays bounded
+
+
+class Beside:
+    """Does jobs in the order they are given: at once, or on a thread of their own.
+
+    Parameters
+    ----------
+    thread : bool
+        Whether on a thread. The compiled sweeps, where the time goes, hold no lock.
+    """
+
+    def __init__(self, thread: bool) -> None:
+        self._pool = ThreadPoolExecutor(1, "beside") if thread else None
+        self._waiting: deque[Future[list[Message]]] = deque()
+
+    def run(self, job: Job) -> Iterator[Message]:
+        """Do a job, or see to it that it is done; says what there is to say by now."""
+        if self._pool is None:
+            yield from job()
+            return
+        while len(self._waiting) >= BACKLOG:
+            yield from self._waiting.popleft().result()
+        self._waiting.append(self._pool.submit(_whole, job))
+
+    def ask(self, question: Callable[[], T]) -> Callable[[], T]:
+        """Have a question answered; gives back what waits for the answer."""
+        if self._pool is None:
+            answer = question()
+            return lambda: answer
+        return self._pool.submit(question).result
+
+    def done(self, *, all: bool = False) -> Iterator[Message]:
+        """What finished jobs have to say; with `all`, after waiting for those that are not finished."""
+        while self._waiting and (all or self._waiting[0].done()):
+            yield from self._waiting.popleft().result()
+
+    def close(self) -> None:
+        """Give up what has not begun."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+
+def _whole(job: Job) -> list[Message]:
+    return list(job())
