@@ -261,7 +261,7 @@ def decode(*log: Path, dialect: str = "ardupilotmega", rounds: int = 3, json: bo
 
 
 def pipeline(
-    *, seconds: float = 60.0, soak: bool = False, vehicles: int = 5, imu: int = 200, json: bool = False
+    *, seconds: float | None = None, soak: bool = False, vehicles: int = 5, imu: int = 200, json: bool = False
 ) -> None:
     """The live pipeline under load, in one and in three processes: losses, age of the estimates, CPU and memory.
 
@@ -271,10 +271,10 @@ def pipeline(
     Parameters
     ----------
     seconds
-        For each of six runs: 1, 5 and 20 thousand messages per second.
+        Of each run that are measured; 60 if not given, 600 of a soak.
     soak
-        One run in three processes instead, 600 s if --seconds is not given, with what the sensors say and nothing
-        beside.
+        One run in three processes, with what the sensors say and nothing beside, instead of six at 1, 5 and 20 thousand
+        messages per second.
     vehicles
         Of the soak.
     imu
@@ -288,9 +288,9 @@ def pipeline(
     from sims.experiments.pipeline_speed import compare, run
 
     if soak:
-        found = run(vehicles, imu, 600.0 if seconds == 60.0 else seconds, say)
+        found = run(vehicles, imu, seconds or 600.0, say)
     else:
-        found = compare(seconds=seconds, tell=say)
+        found = compare(seconds=seconds or 60.0, tell=say)
     if json:
         print(msgspec.json.format(msgspec.json.encode(found)).decode())
     else:
