@@ -12,6 +12,8 @@ from estimator.kinematics import ATTITUDE as ANGLES
 from estimator.kinematics import Earth
 from estimator.models.flight_path import Settings
 from estimator.stage.rows import AIR, ALTITUDE, ATTITUDE, FIX_VELOCITY, FLOW, GNSS, HEIGHT_COLUMN, INERTIAL, SENSORS
+from estimator.stage.shelf import EVER, Shelf
+from estimator.stage.shelf import Rows as Kept
 from estimator.synchronise import Rows, concatenate
 
 Floats = NDArray[np.float64]
@@ -25,7 +27,6 @@ KEPT = {
     AIR: (MEASURED, IMPACT),
     FLOW: (MEASURED + 1, MEASURED + 2),
 }
-EVER = 1 << 62  # ns
 UNSORTED = 1000  # rows that may wait to be sorted by sensor
 HOLE = 1.75  # usual intervals between two samples: from there on one is missing, and not only late
 QUIET = 5.0  # s: a longer silence of a sensor is told
@@ -52,7 +53,8 @@ class Examiner:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._kept: dict[int, list[tuple[Times, Times, Floats]]] = {sensor: [] for sensor in KEPT}
+        self._kept = {sensor: Shelf(len(columns)) for sensor, columns in KEPT.items()}
+        self._fast = False
         self._unsorted: list[tuple[Rows, Times]] = []
         self._count = 0  # of these
 
@@ -60,7 +62,7 @@ class Examiner:
         """What has been kept by now, to be asked while more is taken in here."""
         self._sort()
         other = Examiner(self._settings)
-        other._kept = {sensor: list(parts) for sensor, parts in self._kept.items()}
+        other._kept = {sensor: shelf.so_far() for sensor, shelf in self._kept.items()}
         return other
 
     def take(self, samples: Rows, passed: Times) -> None:
@@ -82,7 +84,7 @@ class Examiner:
         for sensor, columns in KEPT.items():
             mine = np.flatnonzero(samples.sensor == sensor)
             if len(mine):
-                self._kept[sensor].append((samples.t[mine], passed[mine], samples.z[np.ix_(mine, columns)]))
+                self._kept[sensor].put(Kept(samples.t[mine], passed[mine], samples.z[np.ix_(mine, columns)]))
 
     def findings(self, first: int, stop: int, heard: int, taken: float) -> tuple[str, ...]:
         """What is wrong with the sensors from time `first` to `stop`, ns, in words.
@@ -124,8 +126,9 @@ class Examiner:
 
     def fast(self) -> bool:
         """Whether inertial samples have come often enough for a flight path."""
-        t = self._sensor(INERTIAL, -EVER, EVER, EVER)[0]
-        return rate(t) >= SLOWEST
+        if not self._fast:
+            self._fast = rate(self._times(INERTIAL, EVER, EVER)) >= SLOWEST
+        return self._fast
 
     def due(self, first: int, stop: int, heard: int) -> dict[int, tuple[Times, int]]:
         """Times of each sensor's samples between two times, and its usual interval up to then, ns; of those that have
@@ -133,7 +136,7 @@ class Examiner:
         """
         found = {}
         for sensor in KEPT:
-            t = self._sensor(sensor, -EVER, stop, heard)[0]
+            t = self._times(sensor, stop, heard)
             if len(t) >= 10:
                 found[sensor] = t[np.searchsorted(t, first) :], max(int(np.median(np.diff(t))), 1)
         return found
@@ -156,16 +159,15 @@ class Examiner:
             came += len(t)
         return missing / (missing + came) if came else None
 
+    def _times(self, sensor: int, stop: int, heard: int) -> Times:
+        self._sort()
+        t, passed = self._kept[sensor].times(-EVER, stop)
+        return np.unique(t[passed < heard])
+
     def _sensor(self, sensor: int, first: int, stop: int, heard: int) -> tuple[Times, Floats]:
         self._sort()
-        parts = self._kept[sensor]
-        if not parts:
-            return np.empty(0, np.int64), np.empty((0, len(KEPT[sensor])))
-        if len(parts) > 1:
-            t, passed, z = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-            parts[:] = [(t, passed, z)]
-        t, passed, z = parts[0]
-        inside = (t >= first) & (t <= stop) & (passed < heard)
+        t, passed, z = self._kept[sensor].rows(first, stop)
+        inside = passed < heard
         if not inside.all():
             t, z = t[inside], z[inside]
         if (np.diff(t) <= 0).any():  # in order of time, of two at one time the first to arrive, as they are used

@@ -13,10 +13,11 @@ from estimator import consistency
 from estimator.consistency import Tally
 from estimator.kinematics import MEASUREMENTS
 from estimator.models.flight_path import CALM, MODEL, PARAMETERS, FlightPath
-from estimator.stage.examining import EVER, Examiner
+from estimator.stage.examining import Examiner
 from estimator.stage.losing import LOST, loss_effect
 from estimator.stage.losing import alone as begun
 from estimator.stage.settings import STAGE
+from estimator.stage.shelf import EVER
 from estimator.stretch import Smoothed
 from telemetry.messages import Channel, Parameter, Report, Spread
 
