@@ -240,6 +240,9 @@ def record_folder(
     """
     import msgspec
 
+    from viewer import load
+
+    load()
     from viewer.recorder import record
 
     live, windows = folder / "live.rrd", folder / "windows.rrd"
@@ -253,7 +256,7 @@ def record_folder(
         sortie=name,
         properties=properties,
         completeness=lambda: "complete" if finished() else "broken off: the stages had not said their last",
-        interval=0.25,  # every chunk costs a kilobyte, and a viewer shows no more than this
+        interval=0.5,  # a chunk takes as long to write as a hundred rows, and who looks on wants to see things move
         on_alarm=lambda text: say(f"ALARM: {text}"),
     )
     (folder / "report.json").write_bytes(msgspec.json.format(msgspec.json.encode(summary)))
@@ -342,7 +345,8 @@ def follow(
         with Bus(name) as bus:
             subscription = bus.subscribe("record", ["ingest", "estimate"], health=True)
             settings = reception.configuration.estimate
-            stages.run("estimate", lambda: serve(bus, "estimate", ["ingest"], partial(estimate, settings=settings)))
+            flying = partial(estimate, settings=settings, beside=True)
+            stages.run("estimate", lambda: serve(bus, "estimate", ["ingest"], flying))
             stages.run("ingest", lambda: publish(bus, "ingest", reception.messages(idle)))
             ready()
 

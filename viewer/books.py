@@ -24,7 +24,7 @@ from telemetry.messages import (
     StatusText,
     Window,
 )
-from viewer.columns import Seam, first
+from viewer.columns import Seam, first, span
 from viewer.summary import (
     Account,
     Age,
@@ -117,7 +117,7 @@ class Books:
             return
         first = whole.rows == 0
         whole.rows += len(t)
-        low, high, rx = int(t.min()), int(t.max()), (int(t_rx.min()), int(t_rx.max()))
+        (low, high), rx = span(t), span(t_rx)
         whole.t0, whole.t1 = (low, high) if first else (min(whole.t0, low), max(whole.t1, high))
         whole.t_rx0, whole.t_rx1 = rx if first else (min(whole.t_rx0, rx[0]), max(whole.t_rx1, rx[1]))
         match message:

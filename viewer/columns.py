@@ -230,6 +230,13 @@ def joined(messages: Sequence[Message], field: str) -> NDArray[Any]:
     return getattr(messages[0], field) if len(messages) == 1 else np.concatenate([getattr(m, field) for m in messages])
 
 
+def span(t: Times) -> tuple[int, int]:
+    """The first and the last of times in any order."""
+    if len(t) == 1:  # as a rule, live
+        return (only := int(t[0])), only
+    return int(t.min()), int(t.max())
+
+
 _NOWHERE, _NEVER = np.empty(0, np.intp), np.empty(0, np.int64)
 
 
@@ -255,7 +262,7 @@ class Seam:
 
     def find(self, boot: int, t: Times, t_rx: Times) -> tuple[NDArray[np.intp], Times, Times]:
         """Rows before which a break belongs, and the times of the breaks; remembers the rows as seen."""
-        if self.high is not None and boot == self.boot and (newest := int(t.max())) - self.high <= self.gap:
+        if self.high is not None and boot == self.boot and (newest := span(t)[1]) - self.high <= self.gap:
             self.high, self.t_rx = max(self.high, newest), int(t_rx[-1])
             return _NOWHERE, _NEVER, _NEVER  # as a rule; the same as below comes to
         before = np.concatenate([[t[0] if self.high is None else self.high], t])[:-1]

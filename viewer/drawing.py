@@ -29,6 +29,7 @@ from viewer.columns import (
     report_path,
     sensor_columns,
     slug,
+    span,
     vehicle_path,
 )
 from viewer.sink import Sink, degrees
@@ -89,7 +90,7 @@ class Drawing:
     def hear(self, message: Message) -> None:
         """Note that a vehicle was heard; drawn by `presences`."""
         self._heard.setdefault(message.vehicle, []).append(message)
-        epoch, t = (message.vehicle, message.boot), int(message.t.min())
+        epoch, t = (message.vehicle, message.boot), span(message.t)[0]
         self._begun[epoch] = min(t, self._begun.get(epoch, t))
 
     def finish(self, groups: list[Group]) -> None:

@@ -21,7 +21,7 @@ from telemetry.messages import Times
 class Reading:
     """Everything in a recording, by entity.
 
-    A file without footer (its writer was killed) is read as it is. A file that ends inside a message is repaired into a
+    A file without index (its writer was killed) is read as it is. A file that ends inside a message is repaired into a
     temporary copy, which recovers all whole chunks; the original is never touched.
 
     Parameters
@@ -70,7 +70,7 @@ class Reading:
         if not chunks:
             self.remarks.append(f"{file.name} holds nothing")
         elif not footer and not self.truncated:
-            self.remarks.append(f"{file.name} was not closed: its writer stopped without finishing it")
+            self.remarks.append(f"{file.name} has no index: its writer stopped without finishing it")
         for chunk in chunks:
             self.chunks.setdefault(chunk.entity_path, []).append(chunk)
 

@@ -32,11 +32,13 @@ from viewer.blueprint import layout
 from viewer.books import BYTES, CONSUMED, COUNTERS, Books
 from viewer.columns import GAP, TRAJECTORY, Seam, estimate_path, runs, slug, vehicle_path
 from viewer.drawing import Drawing, Group
+from viewer.journal import Journal
 from viewer.sink import Sink, claim
 from viewer.summary import Summary
 from viewer.track import Track
 
 ROWS = 8192  # rows of one entity that are worth a chunk of their own, whatever the time
+SLOW = 2.0  # s of receive time after which what nobody waits for is written
 
 
 def record(
@@ -49,7 +51,6 @@ def record(
     properties: Mapping[str, str] | None = None,
     interval: float | None = 0.1,
     on_alarm: Callable[[str], None] | None = None,
-    index: bool = True,
 ) -> Summary:
     """Write a stream of messages into a recording.
 
@@ -71,9 +72,6 @@ def record(
         Receive time after which what waits is written, s; None offline, where only full chunks are.
     on_alarm : callable, optional
         Told when writing fails or works again. Recording goes on.
-    index : bool
-        Whether the files end with a list of what is in them, as `Sink`. Without, the memory of a long recording stays
-        flat, but ``rerun rrd verify`` and readers that jump want one.
 
     Returns
     -------
@@ -88,7 +86,7 @@ def record(
         If a file cannot be created.
     """
     recorder = Recorder(
-        path, windows=windows, sortie=sortie, properties=properties, interval=interval, on_alarm=on_alarm, index=index
+        path, windows=windows, sortie=sortie, properties=properties, interval=interval, on_alarm=on_alarm
     )
     try:
         for message in messages:
@@ -121,7 +119,6 @@ class Recorder:
         on_alarm: Callable[[str], None] | None = None,
         gap: float = GAP,
         serve: int | None = None,
-        index: bool = True,
     ) -> None:
         self._interval = math.inf if interval is None else interval * 1e9
         self._live = interval is not None
@@ -136,7 +133,7 @@ class Recorder:
             except OSError:
                 path.unlink()  # just created, empty
                 raise
-        self._main = Sink(path, sortie, self._alarm, serve=serve, index=index)
+        self._main = (Journal if self._live else Sink)(path, sortie, self._alarm, serve=serve)
         self._layer = self._main if windows is None else Sink(Path(windows), sortie, self._alarm, join=serve)
         self._books = Books(sortie, gap)
         self._books.summary.properties = dict(properties or {})
@@ -175,7 +172,7 @@ class Recorder:
             self._written_rx = now
         if now - self._written_rx >= self._interval:
             self._written_rx = now
-            slow = now - self._slow_rx >= 1e9
+            slow = now - self._slow_rx >= SLOW * 1e9
             if slow:
                 self._slow_rx = now
             self._write_all(quick=not slow)

@@ -225,6 +225,10 @@ class Sink:
         self._stream.disconnect()
         return done
 
+    def abandon(self) -> None:
+        """Let go of the file as it is."""
+        self._stream.disconnect()
+
     def _stamps(self, t: Times, t_rx: Times, window: int | None) -> list[rr.TimeColumn]:
         """As `stamps`; the states of an estimate have the same times, so the columns are made once for all."""
         last = self._stamped

@@ -14,6 +14,7 @@ from rich.console import Console
 from telemetry import messages as m
 from tests.viewer import flight as f
 from tests.viewer import reconstruction as r
+from tests.viewer.recordings import grown
 from viewer.blueprint import layout
 from viewer.columns import Place, estimate_path, place, report_path, role
 from viewer.plot import _Picture, plot
@@ -212,7 +213,8 @@ def test_live_accounts_are_kept_per_model(live):
 
 def test_a_recording_without_summary_tells_the_same(live, tmp_path):
     folder, summary = live
-    data = (folder / "live.rrd").read_bytes()
+    once = {"windows": tmp_path / "layer.rrd", "interval": 2.0}
+    data = grown(f.batched(r.flight(), 2.0), tmp_path / "grown.rrd", tmp_path / "finished.rrd", **once).read_bytes()
     (tmp_path / "live.rrd").write_bytes(data[: len(data) * 3 // 5])
     (tmp_path / "windows.rrd").write_bytes((folder / "windows.rrd").read_bytes())
     found = review(tmp_path)

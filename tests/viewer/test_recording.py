@@ -15,6 +15,7 @@ from rich.console import Console
 
 from telemetry import messages as m
 from tests.viewer import flight as f
+from tests.viewer.recordings import everything, grown, rerun
 from viewer.comparison import stored
 from viewer.plot import plot
 from viewer.reading import Reading
@@ -52,32 +53,6 @@ def whole(tmp_path_factory):
     rr.set_strict_mode(True)
     path = tmp_path_factory.mktemp("smooth") / "s1.rrd"
     return path, record(f.flight(), path, sortie="s1", interval=None)
-
-
-def rerun(*arguments):
-    return subprocess.run([sys.executable, "-m", "rerun", *map(str, arguments)], capture_output=True, text=True)
-
-
-def everything(path):
-    """All numbers of a recording, by entity and component."""
-    found = {}
-    with Reading(path) as reading:
-        for entity in sorted(reading.chunks):
-            if entity.startswith("/__") or entity.endswith(("/boot", "/window", "/report")):
-                continue
-            for component in (
-                "Scalars:scalars",
-                "Measurements:values",
-                "Measurements:variances",
-                "TextLog:text",
-                "LineStrips3D:strips",
-                "Points3D:positions",
-                "GeoLineStrings:line_strings",
-            ):
-                t, (rows,) = reading.columns(entity, (component,), ("t_vehicle", "t_rx"))
-                if len(t[0]):
-                    found[entity, component] = [*(x.tolist() for x in t), repr(rows.tolist())]
-    return found
 
 
 def test_both_files_verify_and_share_the_recording_id(live):
@@ -182,13 +157,13 @@ def test_comparison_finds_what_was_changed(live):
     assert len(none) == 12 and all(d.what == "entity" for d in none)
 
 
-def test_a_recording_cut_in_the_middle_is_still_reviewed(live, tmp_path):
-    folder, _ = live
-    data = (folder / "live.rrd").read_bytes()
+def test_a_recording_cut_in_the_middle_is_still_reviewed(tmp_path):
+    messages = f.batched(f.flight(), 0.5)
+    data = grown(messages, tmp_path / "grown.rrd", tmp_path / "finished.rrd", interval=0.5).read_bytes()
     cut = tmp_path / "cut.rrd"
     cut.write_bytes(data[: len(data) * 3 // 5])
     found = review(cut)
-    assert not found.closed and found.summary.completeness == "truncated" and found.summary.sortie == "s1"
+    assert not found.closed and found.summary.completeness == "truncated" and found.summary.sortie == "grown"
     assert any("middle of a message" in remark for remark in found.remarks)
     assert any("not closed cleanly" in remark for remark in found.remarks)
     (vehicle,) = found.summary.vehicles
@@ -276,6 +251,7 @@ print(summary.completeness, len(summary.alarms), len(heard), summary.alarms[0])
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("truncated 1 1 ") and "writing fails" in done.stdout
     assert review(tmp_path / "full.rrd").summary.completeness in ("truncated", "not closed")
+    assert [path.name for path in tmp_path.iterdir()] == ["full.rrd"]
 
 
 def test_an_error_upstream_keeps_what_was_recorded(tmp_path):
