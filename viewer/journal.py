@@ -205,14 +205,18 @@ class Journal(Sink):
         super().layout(blueprint)
         self._blueprint = blueprint
 
-    def flush(self, timeout: float = 10.0) -> bool:
-        """Bring everything to the disk's queue. Where that fails, what would have lasted leaves its room to what is
-        there.
-        """
-        done = super().flush(timeout)
-        if self._whole is not None and not (done and self._whole.sink.flush(timeout)):
-            self._abandon()
-        return done
+    def sync(self, timeout: float = 10.0) -> Callable[[], bool]:
+        """As of `Sink`. Where it fails, what would have lasted leaves its room to what is there."""
+        growing, whole = super().sync(timeout), self._whole
+        lasting = None if whole is None else whole.sink.sync(timeout)
+
+        def settle() -> bool:
+            done = growing()
+            if lasting is not None and self._whole is whole and not (done and lasting()):
+                self._abandon()
+            return done
+
+        return settle
 
     def close(self) -> bool:
         """Flush, and put what lasts in the place of what grew."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,7 @@ from telemetry.messages import (
     StatusText,
     Window,
 )
-from viewer.blueprint import layout
+from viewer.blueprint import Extent, layout
 from viewer.books import BYTES, CONSUMED, COUNTERS, Books
 from viewer.columns import GAP, TRAJECTORY, Seam, estimate_path, runs, slug, vehicle_path
 from viewer.drawing import Drawing, Group
@@ -39,6 +41,8 @@ from viewer.track import Track
 
 ROWS = 8192  # rows of one entity that are worth a chunk of their own, whatever the time
 SLOW = 2.0  # s of receive time after which what nobody waits for is written
+FLUSH = 1.0  # s between two flushes
+STEP = 10.0  # s: by so much no receive time is behind another, unless the clock has been set back
 
 
 def record(
@@ -144,8 +148,10 @@ class Recorder:
         self._groups: dict[tuple[Any, ...], Group] = {}
         self._components: dict[tuple[int, str], dict[tuple[str, bool], str]] = {}
         self._drawn: frozenset[str] = frozenset()
-        self._written_rx: int | None = None
-        self._slow_rx = 0
+        # Receive times from which on groups wait, in order; by quickness.
+        self._waiting: dict[bool, deque[tuple[int, Group]]] = {True: deque(), False: deque()}
+        self._thread = ThreadPoolExecutor(1, "record")  # flushes and lays out, which takes longer than data may wait
+        self._flushing: Future[list[Callable[[], bool]]] | None = None
         self._flushed = time.monotonic()
 
     def write(self, message: Message) -> None:
@@ -161,33 +167,50 @@ class Recorder:
                 self._drawing.report(message)
             else:
                 group = self._group(message)
+                if self._live and not group.messages:
+                    self._waiting[group.quick].append((int(message.t_rx[-1]), group))
                 group.messages.append(message)
                 group.rows[0] += len(message.t)
                 if group.rows[0] >= ROWS:
                     self._write(group)
         if isinstance(message, SENSORS):
             self._drawing.hear(message)
-        now = int(message.t_rx[-1])
-        if self._written_rx is None:
-            self._written_rx = now
-        if now - self._written_rx >= self._interval:
-            self._written_rx = now
-            slow = now - self._slow_rx >= SLOW * 1e9
-            if slow:
-                self._slow_rx = now
-            self._write_all(quick=not slow)
-        if time.monotonic() - self._flushed >= 1.0:
-            self.flush()
+        if self._live:
+            self._write_due(int(message.t_rx[-1]))
+        if self._flushing is not None and self._flushing.done():
+            self._settle()
+        if self._flushing is None and time.monotonic() - self._flushed >= FLUSH:
+            self._begin_flush()
 
     def flush(self) -> None:
-        """Bring what has been written so far to the disk; a failure is an alarm, not an error."""
+        """Bring everything to the disk; a failure is an alarm, not an error."""
+        self._settle()
         if self._live:
-            self._write_all(quick=True)
-        self._arrange()
-        self._main.flush()
-        if self._layer is not self._main:
-            self._layer.flush()
+            self._write_all()
+        self._begin_flush()
+        self._settle()
+
+    def _begin_flush(self) -> None:
+        """Bring what has been written to the disk, and the layout up to date, while this goes on."""
         self._flushed = time.monotonic()
+        entities, extents = frozenset(self._main.entities | self._layer.entities), dict(self._drawing.extents)
+        self._flushing = self._thread.submit(self._bring, entities, extents, self._live)
+
+    def _settle(self) -> None:
+        """Wait for a flush that is under way, and take note of what became of it."""
+        if self._flushing is not None:
+            flushing, self._flushing = self._flushing, None
+            for rest in flushing.result():
+                rest()
+
+    def _bring(
+        self, entities: frozenset[str], extents: Mapping[str, Extent], live: bool, again: bool = False
+    ) -> list[Callable[[], bool]]:
+        """Store the layout anew when there is more to lay out, and flush; in the thread."""
+        if again or entities != self._drawn:
+            self._drawn = entities
+            self._main.layout(layout(entities, extents, live=live))
+        return [sink.sync() for sink in ([self._main] if self._layer is self._main else [self._main, self._layer])]
 
     def close(self, completeness: str = "complete") -> Summary:
         """Write what waits, store the summary and finish the files."""
@@ -200,8 +223,10 @@ class Recorder:
             )
         else:
             self._main.started(self._books.summary.t_rx0)
-        self._arrange(last=True)
-        whole = [sink.flush() for sink in {id(s): s for s in (self._main, self._layer)}.values()]
+        self._settle()
+        entities = frozenset(self._main.entities | self._layer.entities)
+        whole = [rest() for rest in self._bring(entities, self._drawing.extents, live=False, again=True)]
+        self._thread.shutdown()
         if empty:
             completeness = "no data"
         elif (self._alarms and completeness == "complete") or not all(whole):
@@ -263,10 +288,20 @@ class Recorder:
             self._groups[key] = Group(parent, [], Seam(self._gap), track, [0], quick)
         return self._groups[key]
 
-    def _write_all(self, *, quick: bool = False) -> None:
+    def _write_all(self) -> None:
         for group in self._groups.values():
-            if group.messages and (group.quick or not quick):
+            if group.messages:
                 self._write(group)
+
+    def _write_due(self, now: int) -> None:
+        """Write one group of each quickness, if it is time: all at once would keep the messages behind waiting."""
+        for quick, queue in self._waiting.items():
+            wait = self._interval if quick else max(self._interval, SLOW * 1e9)
+            while queue and not now - wait < queue[0][0] < now + STEP * 1e9:
+                group = queue.popleft()[1]
+                if group.messages:  # else written before, because it was full
+                    self._write(group)
+                    break
 
     def _write(self, group: Group) -> None:
         messages = list(group.messages)
@@ -290,11 +325,3 @@ class Recorder:
             case _:
                 for run in runs(messages):
                     self._drawing.sensor(group, run)
-
-    def _arrange(self, *, last: bool = False) -> None:
-        """Store the layout anew when there is more to lay out."""
-        entities = frozenset(self._main.entities | self._layer.entities)
-        if last or entities != self._drawn:
-            self._drawn = entities
-            live = self._live and not last
-            self._main.layout(layout(entities, self._drawing.extents, live=live))

@@ -105,11 +105,12 @@ def _log(reading: Reading) -> list[Line]:
 def _rebuilt(reading: Reading, log: list[Line]) -> Summary:
     """A summary from the data alone."""
     run = "/__properties/run"
+    estimator = reading.constant(run, "estimator")
     summary = Summary(
         sortie=str(reading.constant(run, "sortie") or ""),
         completeness="truncated" if reading.truncated else "not closed",
         gap=float(reading.constant(run, "gap") or 0.0),
-        properties={},
+        properties={} if estimator is None else {"estimator": str(estimator)},
         vehicles=[],
         accounts=[],
         byte_accounts=[],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -205,12 +206,21 @@ class Sink:
 
     def flush(self, timeout: float = 10.0) -> bool:
         """Bring everything to the disk's queue; False when that fails, which the SDK tells nowhere else."""
+        return self.sync(timeout)()
+
+    def sync(self, timeout: float = 10.0) -> Callable[[], bool]:
+        """The part of `flush` that takes time and may be done in another thread; gives back the rest of it."""
         try:
             self._stream.flush(timeout_sec=timeout)
         except Exception as error:  # the SDK raises a bare RuntimeError, and bindings may change it
+            return partial(self._settle, str(error))
+        return partial(self._settle, None)
+
+    def _settle(self, trouble: str | None) -> bool:
+        if trouble is not None:
             if not self.failing:
                 self._on_alarm(
-                    f"{self.path}: writing fails ({error}): free space on the disk; the raw log is not affected"
+                    f"{self.path}: writing fails ({trouble}): free space on the disk; the raw log is not affected"
                 )
             self.failing = True
             return False
