@@ -115,6 +115,9 @@ class Books:
         whole.messages += 1
         if isinstance(message, Progress):
             return
+        if isinstance(message, Health):  # what stages say of themselves is no sample of a vehicle
+            self._health(message)
+            return
         first = whole.rows == 0
         whole.rows += len(t)
         (low, high), rx = span(t), span(t_rx)
@@ -140,8 +143,6 @@ class Books:
                     self._level("INFO")
             case ClockFit():
                 self._clock(message)
-            case Health():
-                self._health(message)
             case LinkStats():
                 counts = {name: int(getattr(message, name)[-1]) for name in COUNTERS}
                 self._links[message.vehicle, message.source] = Account(

@@ -12,6 +12,7 @@ from functools import lru_cache
 from itertools import groupby
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -228,6 +229,14 @@ def runs(messages: Sequence[Message]) -> Iterator[list[Any]]:
 def joined(messages: Sequence[Message], field: str) -> NDArray[Any]:
     """One column of several messages, end to end."""
     return getattr(messages[0], field) if len(messages) == 1 else np.concatenate([getattr(m, field) for m in messages])
+
+
+def merged(run: Sequence[Any]) -> Any:
+    """Estimates or windows of one run as one."""
+    if len(run) == 1:
+        return run[0]
+    columns = [name for name in run[0].__struct_fields__ if isinstance(getattr(run[0], name), np.ndarray)]
+    return msgspec.structs.replace(run[0], **{name: joined(run, name) for name in columns})
 
 
 def span(t: Times) -> tuple[int, int]:

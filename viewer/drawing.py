@@ -25,6 +25,7 @@ from viewer.columns import (
     geodetic,
     joined,
     local_metres,
+    merged,
     place,
     report_path,
     sensor_columns,
@@ -190,12 +191,10 @@ class Drawing:
     def _beliefs(
         self, sink: Sink, run: list[Any], t: Times, t_rx: Times, at: NDArray[np.intp], window: int | None
     ) -> None:
-        parts = [belief_columns(message) for message in run]
-        for entity, name in zip(parts[0], run[0].names, strict=True):
-            beliefs = [part[entity] for part in parts]
-            values = broken(np.concatenate([b.values for b in beliefs]), at)
-            variances = broken(np.concatenate([b.variances for b in beliefs]), at)
-            self._style(sink, entity, style.belief, entity, name, beliefs[0].unit)
+        whole = merged(run)
+        for (entity, belief), name in zip(belief_columns(whole).items(), whole.names, strict=True):
+            self._style(sink, entity, style.belief, entity, name, belief.unit)
+            values, variances = broken(belief.values, at), broken(belief.variances, at)
             sink.measurements(entity, t, t_rx, values, variances, window)
         entity = f"{estimate_path(run[0])}/geodetic"
         points = broken(joined(run, "geodetic"), at)

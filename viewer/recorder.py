@@ -177,9 +177,10 @@ class Recorder:
             self._drawing.hear(message)
         if self._live:
             self._write_due(int(message.t_rx[-1]))
-        if self._flushing is not None and self._flushing.done():
-            self._settle()
-        if self._flushing is None and time.monotonic() - self._flushed >= FLUSH:
+        late = time.monotonic() - self._flushed >= FLUSH
+        if self._flushing is not None and (late or self._flushing.done()):
+            self._settle()  # what comes faster than it can be written waits here, and not in memory
+        if late:
             self._begin_flush()
 
     def flush(self) -> None:

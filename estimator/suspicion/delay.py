@@ -214,6 +214,12 @@ def _problem(columns: Columns, arm: tuple[float, float, float]) -> _Problem | No
     return _Problem(times, integral, starts[:-1], starts[1:], when[chosen], what[chosen], present, np.array(arm))
 
 
+def warm_up() -> None:
+    """Compile what is needed only after an aircraft has manoeuvred, so that nothing waits for it then."""
+    t, rows, ends = np.arange(2.0), np.zeros((2, 3)), np.array([0, 2])
+    integrals(t, rows, rows, ends[:-1], ends[1:], np.zeros((2, 30)))
+
+
 def _down(columns: Columns, start: int, fix: Floats, down: Floats) -> Floats:
     """Velocity down at the fixes, m/s, from the altimeter where the receiver does not report it, else zero."""
     if np.isfinite(down).all():
