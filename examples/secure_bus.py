@@ -55,13 +55,13 @@ def fly(endpoint: str, folder: Path) -> None:
     ):
         forged = viewer.publisher("ingest")
         forged.put(event("forged", t=0, t_rx=0))
+        subscription = viewer.subscribe("viewer", ["ingest", "estimate"])  # first: nobody waits long for who looks on
         told = [
             threading.Thread(target=publish, args=(ingest, "ingest", words())),
             threading.Thread(target=serve, args=(estimate, "estimate", ["ingest"], iter)),
         ]
         for thread in told:
             thread.start()
-        subscription = viewer.subscribe("viewer", ["ingest", "estimate"])
         heard = [message for message in subscription if isinstance(message, Event)]
         subscription.close()
         for thread in told:
