@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
+import shutil
 import signal
 import subprocess
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -23,32 +26,54 @@ def flight():
     return sims.fly("c172x", "demo", duration=80)
 
 
-def send(flight, port: int, faults: str | None = None):
-    return sims.send(sims.frames(flight), f"udpout:127.0.0.1:{port}", speed=SPEED, faults=faults)
+def send(flight, port: int, faults: str | None = None, until: float = math.inf):
+    frames = ((t, frame) for t, frame in sims.frames(flight) if t < until * 1e9)
+    return sims.send(frames, f"udpout:127.0.0.1:{port}", speed=SPEED, faults=faults)
 
 
 def review(folder) -> dict:
     return json.loads(run("review", folder, "--json").stdout)
 
 
-def test_live_equals_replay_and_nothing_is_lost(flight, tmp_path):
-    port = free_port()
-    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", tmp_path / "s", "--idle", 1.5) as live:
+@pytest.fixture(scope="module")
+def flown(flight, tmp_path_factory):
+    """A sortie over a bad radio, from the first frame until nothing more comes."""
+    port, folder = free_port(), tmp_path_factory.mktemp("flown") / "s"
+    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", folder, "--idle", 1.5) as live:
         live.wait_for("listening")
         sent = send(flight, port, "loss=0.01,corrupt=0.002,outage=75:4")
         assert live.end() == 0, live.said
-    verified = run("verify", tmp_path / "s")
+    return SimpleNamespace(folder=folder, sent=sent)
+
+
+@pytest.fixture(scope="module")
+def interrupted(flight, tmp_path_factory):
+    """A sortie that ends with Ctrl-C soon after a test point, and what was said until then."""
+    port, folder = free_port(), tmp_path_factory.mktemp("interrupted") / "s"
+    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", folder) as live:
+        live.wait_for("listening")
+        send(flight, port)
+        live.wait_for("test point 1", timeout=2)
+        before = live.said
+        time.sleep(0.3)
+        live.process.send_signal(signal.SIGINT)
+        assert live.end() == 0, live.said
+    return SimpleNamespace(folder=folder, before=before, said=live.said)
+
+
+def test_live_equals_replay_and_nothing_is_lost(flown):
+    verified = run("verify", flown.folder)
     assert verified.returncode == 0, verified.stdout + verified.stderr
     assert "live equals replay, bit for bit" in verified.stdout
     for name in ("live.rrd", "windows.rrd"):
-        assert subprocess.run([RERUN, "rrd", "verify", tmp_path / "s" / name], check=False).returncode == 0
-    found = review(tmp_path / "s")
+        assert subprocess.run([RERUN, "rrd", "verify", flown.folder / name], check=False).returncode == 0
+    found = review(flown.folder)
     (account,) = found["summary"]["accounts"]
     (octets,) = found["summary"]["byte_accounts"]
-    injected = sent.injected
+    injected = flown.sent.injected
     # A frame whose id was hit looks like one of a dialect that we do not know: it has a number, but no checksum.
     refused = injected.corrupted - octets["unknown"]
-    assert account["received"] == octets["frames"] == sent.datagrams - refused
+    assert account["received"] == octets["frames"] == flown.sent.datagrams - refused
     assert 0 < octets["corrupt"] <= refused, "one hit in its first byte does not even begin like a frame"
     off = account["lost"] - (injected.lost + injected.outage + refused)
     turns = round(off / 256)  # at 20 times real time the outage is a blink, and a busy machine loses count of turns
@@ -59,30 +84,18 @@ def test_live_equals_replay_and_nothing_is_lost(flight, tmp_path):
     assert any(w["reason"] == "gap" for w in windows)
 
 
-def test_a_test_point_is_smoothed_while_the_flight_goes_on(flight, tmp_path):
-    port = free_port()
-    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", tmp_path / "s", "--idle", 3) as live:
-        live.wait_for("listening")
-        send(flight, port)
-        live.wait_for("test point 1", timeout=2)
-        live.process.send_signal(signal.SIGINT)
-        assert live.end() == 0, live.said
+def test_a_test_point_is_smoothed_while_the_flight_goes_on(interrupted):
+    assert "test point 1" in interrupted.before
+    assert "closing" not in interrupted.before
 
 
-def test_interrupted_it_closes_the_window_the_recording_and_the_log(flight, tmp_path):
-    port = free_port()
-    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", tmp_path / "s") as live:
-        live.wait_for("listening")
-        send(flight, port)
-        time.sleep(0.3)
-        live.process.send_signal(signal.SIGINT)
-        assert live.end() == 0, live.said
-    assert "closing: the window, the recording and the raw log" in live.said
-    found = review(tmp_path / "s")
+def test_interrupted_it_closes_the_window_the_recording_and_the_log(interrupted):
+    assert "closing: the window, the recording and the raw log" in interrupted.said
+    found = review(interrupted.folder)
     assert found["closed"]
     assert found["summary"]["completeness"] == "complete"
     assert found["summary"]["windows"][-1]["reason"] == "end"
-    assert run("verify", tmp_path / "s").returncode == 0
+    assert run("verify", interrupted.folder).returncode == 0
 
 
 def test_three_processes_give_the_same_estimates_as_one(flight, tmp_path):
@@ -123,9 +136,9 @@ def test_interrupted_while_telemetry_goes_on(flight, tmp_path):
     port = free_port()
     with Process("live", f"udpin:127.0.0.1:{port}", "--folder", tmp_path / "s") as live:
         live.wait_for("listening")
-        sender = threading.Thread(target=send, args=(flight, port))
+        sender = threading.Thread(target=send, args=(flight, port, None, 54.0))
         sender.start()
-        time.sleep(2.0)
+        time.sleep(1.2)
         live.process.send_signal(signal.SIGINT)
         begin = time.monotonic()
         assert live.end() == 0, live.said
@@ -143,7 +156,7 @@ def test_a_recording_that_fails_does_not_take_the_evidence_with_it(flight, tmp_p
             time.sleep(0.001)
         (tmp_path / "s" / "live.rrd").write_text("in the way")
         live.wait_for("ALARM")
-        sent = send(flight, port)
+        sent = send(flight, port, until=24.0)
         assert live.end() == 1
     assert "live.rrd exists and a recording is never overwritten" in live.said
     assert (tmp_path / "s" / "raw.tlog").stat().st_size == sent.octets + 8 * sent.datagrams
@@ -158,12 +171,8 @@ def test_nothing_received_is_said(tmp_path):
     assert review(tmp_path / "s")["summary"]["completeness"] == "no data"
 
 
-def test_verify_finds_a_recording_that_is_not_of_its_log(flight, tmp_path):
-    port = free_port()
-    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", tmp_path / "s", "--idle", 1.5) as live:
-        live.wait_for("listening")
-        send(flight, port)
-        assert live.end() == 0, live.said
+def test_verify_finds_a_recording_that_is_not_of_its_log(flown, tmp_path):
+    shutil.copytree(flown.folder, tmp_path / "s")
     raw = tmp_path / "s" / "raw.tlog"
     raw.write_bytes(raw.read_bytes()[:-20_000])
     done = run("verify", tmp_path / "s")

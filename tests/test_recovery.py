@@ -20,7 +20,7 @@ from telemetry.sources.tlog import TlogSource
 from tests.console import Process, free_port, run
 
 KILLS = int(os.environ.get("SORTIE_KILLS", "3"))
-DURATION = float(os.environ.get("SORTIE_FLIGHT", "40"))
+DURATION = float(os.environ.get("SORTIE_FLIGHT", "30"))
 SPEED = 3.0 if KILLS <= 3 else 1.0
 SEED = int(os.environ.get("SORTIE_SEED", "1"))
 

@@ -36,7 +36,18 @@ def truths():
     }
 
 
+SAID: dict[tuple, Columns] = {}
+
+
 def columns(truth, grade, seed=1, delay=0.0) -> Columns:
+    """What sensors say of a flight, drawn once: a test changes copies."""
+    key = id(truth), grade, seed, delay
+    if key not in SAID:
+        SAID[key] = drawn(truth, grade, seed, delay)
+    return SAID[key]
+
+
+def drawn(truth, grade, seed, delay) -> Columns:
     said = sense(truth, grade, seed=seed, latencies={"gnss": delay} if delay else None)
     height = np.interp(said.pitot.t, said.static.t, said.static.altitude)
     density = (1.0 - 2.25577e-5 * height) ** 4.2559  # over that at sea level

@@ -45,10 +45,21 @@ class Receiver:
         self.socket.close()
 
 
+def together(frames, receiver, share=1.0):
+    """The frames, never more of them ahead of a receiver on a busy machine than the buffer of its socket holds."""
+    for i, item in enumerate(frames):
+        end = time.monotonic() + 20.0
+        while share * i - len(receiver.got) > 100:
+            assert time.monotonic() < end, f"{len(receiver.got)} of {i} frames arrived"
+            time.sleep(1e-3)
+        yield item
+
+
 def test_every_frame_arrives_at_full_speed(sent):
     told = []
     with Receiver() as receiver:
-        report = sims.send(sent, receiver.endpoint, speed=math.inf, progress=lambda *where: told.append(where))
+        frames = together(sent, receiver)
+        report = sims.send(frames, receiver.endpoint, speed=math.inf, progress=lambda *where: told.append(where))
     assert [data for _, data in receiver.got] == [frame for _, frame in sent]
     assert report.datagrams == len(sent)
     assert report.octets == sum(len(frame) for _, frame in sent)
@@ -60,18 +71,22 @@ def test_every_frame_arrives_at_full_speed(sent):
 
 def test_the_pace_is_the_one_asked_for(sent):
     four = [item for item in sent if item[0] < 8_000_000_000]
-    with Receiver() as receiver:
-        report = sims.send(four, receiver.endpoint, speed=4.0)
-    assert report.took == pytest.approx(1.0, abs=0.1)
-    start = receiver.got[0][0]
-    late = [at - start - (t - four[0][0]) * 1e-9 / 4 for (at, _), (t, _) in zip(receiver.got, four, strict=True)]
-    assert sorted(late)[len(late) // 2] < 0.02
+    for _ in range(5):  # a busy machine is late now and then
+        with Receiver() as receiver:
+            report = sims.send(four, receiver.endpoint, speed=4.0)
+        start = receiver.got[0][0]
+        late = [at - start - (t - four[0][0]) * 1e-9 / 4 for (at, _), (t, _) in zip(receiver.got, four, strict=True)]
+        median = sorted(late)[len(late) // 2]
+        if report.took == pytest.approx(1.0, abs=0.1) and median < 0.02:
+            return
+    pytest.fail(f"4 s took {report.took} s at four times their pace, frames were late by {median} s")
 
 
 def test_faults_are_injected_on_the_way(sent):
     some = sent[:3000]
     with Receiver() as receiver:
-        report = sims.send(some, receiver.endpoint, speed=math.inf, faults="loss=0.1,duplicate=0.05,corrupt=0.02")
+        frames, faults = together(some, receiver, 0.9), "loss=0.1,duplicate=0.05,corrupt=0.02"
+        report = sims.send(frames, receiver.endpoint, speed=math.inf, faults=faults)
     assert len(receiver.got) == report.injected.delivered == report.datagrams
     good = {frame for _, frame in some}
     assert sum(data not in good for _, data in receiver.got) == report.injected.corrupted > 0

@@ -143,7 +143,7 @@ def test_finish_waits_for_a_slow_consumer():
         thread = threading.Thread(target=slowly)
         thread.start()
         assert publish(bus, "ingest", stream(200))
-        assert len(done) == 201
+        assert heard(done, "slow") == list(range(201))
         thread.join()
         subscription.close()
 
@@ -568,7 +568,7 @@ def test_a_stage_is_gone_only_before_its_last_word(port, monkeypatch):
         with Bus("s", connect=[endpoint]) as client:
             assert publish(client, "ingest", stream(5))
             client.publisher("estimate").put(next(stream(1)))
-            wait_for(lambda: len(received) == 7)
+            wait_for(lambda: len(heard(received)) == 7)
         wait_for(lambda: told(received))
         time.sleep(0.5)
         subscription.stop()

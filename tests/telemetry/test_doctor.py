@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import pty
+import re
 import resource
 import socket
 import subprocess
@@ -183,11 +184,14 @@ def test_a_bus_that_nobody_carries_is_an_error_and_one_that_is_there_is_not(heal
 
 
 def test_a_clock_that_is_being_set_is_seen():
-    now = time.time_ns(), time.monotonic_ns()
-    assert of(list(doctor._clock(now, 0.0)), "clock rate")[0].level == "ok"
-    stepped = of(list(doctor._clock((now[0] - 5_000_000, now[1]), 0.0)), "clock rate")[0]
+    def told(step: int) -> doctor.Finding:
+        return of(list(doctor._clock((time.time_ns() - step, time.monotonic_ns()), 0.0)), "clock rate")[0]
+
+    assert any(told(0).level == "ok" for _ in range(20)), "a busy machine may read the two clocks a little apart"
+    stepped = told(5_000_000_000)
     assert stepped.level == "warning"
-    assert "differ by 50" in stepped.text
+    (apart,) = re.findall(r"differ by (\d+) us", stepped.text)
+    assert int(apart) == pytest.approx(5e6, rel=0.02)
 
 
 def test_whether_the_clock_is_synchronised_is_the_kernels_word():

@@ -47,7 +47,8 @@ def test_what_the_flight_does_not_say_is_filled_up_to_the_rate(flight):
     assert inertial == pytest.approx(3 * 4 * speed.IMU, abs=6)
 
 
-def test_everything_is_sent_in_its_own_time(flight):
+def test_everything_is_sent_in_its_own_time(flight, monkeypatch):
+    monkeypatch.setattr(load, "STAGGER", 200_000_000)
     frames = load.encode(told(flight, seconds=0.5))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.bind(("127.0.0.1", 0))
