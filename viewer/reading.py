@@ -86,7 +86,8 @@ class Reading:
                 raise ValueError(f"{file} is not a recording that can be read: {error}") from None
             chunks, _ = _chunks(copy)
             self.remarks.append(
-                f"{file.name} ends in the middle of a message: all whole chunks were recovered into a temporary copy"
+                f"{file.name} ends in the middle of a message: all whole chunks were recovered into a temporary copy; "
+                f"the viewer refuses the file itself: rerun rrd optimize {file} -o FILE writes one that it opens"
             )
             return chunks
 
