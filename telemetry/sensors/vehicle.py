@@ -219,6 +219,7 @@ class Sensors:
             uses.append(Use(words, why, rank, (component, instance), feed, believed=believed))
         return Stream(words, f"{source}.{instance}" if instance else source, uses, message.stamp)
 
+    @np.errstate(invalid="ignore")  # any bits may come from a wire: a signalling NaN is a NaN
     def _read(
         self, use: Use, component: int, source: str, rows: NDArray[np.int64], values: NDArray[Any], batch: Batch
     ) -> None:
@@ -252,6 +253,7 @@ class Sensors:
                     valid[kept[doubted]] = False
         batch.add(feed.kind, use, source, rows, columns, valid)
 
+    @np.errstate(invalid="ignore")  # any bits may come from a wire: a signalling NaN is a NaN
     def _read_own(self, decoded: Decoded, sources: Mapping[int, str], batch: Batch) -> None:
         for own in (own for found in self._own.values() for own in found):
             feed = own.feed

@@ -14,6 +14,7 @@ from itertools import pairwise
 from random import Random
 
 import fastcrc
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -29,6 +30,7 @@ ROUND = 500
 MOST = 559  # bytes that a stream may keep waiting
 GROWTH = 400 << 20  # bytes by which the process may grow
 US = 1_700_000_000_000_000
+pytestmark = pytest.mark.timeout(300 + INPUTS // 500)
 IDS = sorted(DIALECT.layouts)
 SPOKEN = [
     0, 1, 2, 24, 27, 29, 30, 31, 33, 36, 74, 105, 109, 116, 124, 129, 132, 147, 168, 242, 251, 253, 295, 331, 11020,
@@ -229,6 +231,16 @@ def test_ingest_survives_anything_and_its_byte_account_adds_up():
         assert replay["bytes"] == sum(int(b.length.sum()) for b in batches) + replay["discarded"] + replay["pending"]
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     assert grown * 1024 < GROWTH
+
+
+def test_a_signalling_nan_is_a_nan_and_no_more():
+    batches = []
+    for sender in range(1, 9):
+        size = DIALECT.layouts[105].itemsize
+        payload = (1_000_000).to_bytes(8, "little") + b"\x01\x00\xa0\x7f" * 13 + b"\xff" * (size - 60)
+        frame = bytes([0xFD, size, 0, 0, 0, sender, 1]) + (105).to_bytes(3, "little") + payload
+        batches.append(frame + checksum(frame, len(frame), 105).to_bytes(2, "little"))
+    assert told([scan(*batches)], 1)["frames"] == 8
 
 
 @given(st.lists(st.binary(max_size=80), max_size=8), st.booleans())
