@@ -257,8 +257,11 @@ class FlightPath(NamedTuple):
             sigma["u"] = sigma["v"] = sigma["w"] = 5.0
         return np.array([sigma[name] for name in self.names])
 
-    def start(self, values: dict[str, float], sigma: Floats | None = None) -> extended.Carry:
-        """Begin from named values (zero where none is given) with standard deviations (n,), those of the prior if none.
+    def beginning(self, values: dict[str, float], sigma: Floats | None = None) -> tuple[Floats, Floats, Floats]:
+        """What is known of a start at named values (zero where none is given) with standard deviations (n,).
+
+        Those of the prior if none are given. Returns the states (23,) by number, rotation zero, the attitude (4,), and
+        the covariance (n, n) in the order of the model's factor.
 
         Raises
         ------
@@ -283,7 +286,19 @@ class FlightPath(NamedTuple):
         told = np.array([*range(13), *order[: n - 13]])
         to_factor = [int(np.flatnonzero(told == state)[0]) for state in order]
         covariance = covariance[np.ix_(to_factor, to_factor)]
-        upper, d = factored(0.5 * (covariance + covariance.T))
+        return x, q, 0.5 * (covariance + covariance.T)
+
+    def start(self, values: dict[str, float], sigma: Floats | None = None) -> extended.Carry:
+        """The carry of the extended smoother at a `beginning`.
+
+        Raises
+        ------
+        ValueError
+            A value is not finite.
+        """
+        x, q, covariance = self.beginning(values, sigma)
+        upper, d = factored(covariance)
+        n, order = self.n, self.model.order
         ut = np.concatenate([np.zeros((n, 1)), upper.T], axis=1)
         return extended.Carry(
             np.ascontiguousarray(ut), np.array(d), x[order].copy(), x, q, np.eye(7), np.zeros((7, 6)), np.ones(1),
