@@ -10,33 +10,32 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from telling import Failure
 
 DISTRIBUTION = "sortie-telemetry"
+Estimator = Literal["ms", "cubature"]  # those of the stage, which is not loaded to say so
 
 
-def configure(path: Path | None, dialect: str | None = None) -> Any:
-    """Settings of the stages, from a TOML file with the tables [ingest] and [estimate]; `dialect` replaces its own.
+def configure(path: Path | None, dialect: str | None = None, estimator: str | None = None) -> Any:
+    """Settings of the stages, from a TOML file with the tables [ingest] and [estimate]; `dialect` and `estimator`
+    replace its own.
 
     A ``grade`` in [estimate.flight_path] stands for all settings of that grade of sensors; what is given beside it
     replaces one of them.
     """
     import msgspec
 
-    import estimator.stage
-    import telemetry.ingest
+    from estimator.stage.settings import Settings as Estimate
+    from telemetry.ingest import Settings as Ingest
     from telemetry.mavlink import Dialect
     from telemetry.sensors import check
     from telemetry.text import check_mark
 
     kind = msgspec.defstruct(
         "Configuration",
-        [
-            ("ingest", telemetry.ingest.Settings, telemetry.ingest.Settings()),
-            ("estimate", estimator.stage.Settings, estimator.stage.Settings()),
-        ],
+        [("ingest", Ingest, Ingest()), ("estimate", Estimate, Estimate())],
         forbid_unknown_fields=True,
         frozen=True,
     )
@@ -45,7 +44,8 @@ def configure(path: Path | None, dialect: str | None = None) -> Any:
         flight = told.get("estimate", {}).get("flight_path", {})
         if "grade" in flight:
             told["estimate"]["flight_path"] = _graded(flight)
-        configuration = _speaking(msgspec.convert(told, type=kind), dialect)
+        _check_estimator(told.get("estimate", {}).get("estimator", "ms"))
+        configuration = estimating(_speaking(msgspec.convert(told, type=kind), dialect), estimator)
         check_mark(configuration.ingest.mark)
         check(configuration.ingest.sensors, Dialect(configuration.ingest.dialect))
     except ValueError as error:  # msgspec's own are among them
@@ -61,6 +61,41 @@ def _speaking(configuration: Any, dialect: str | None) -> Any:
         return configuration
     ingest = msgspec.structs.replace(configuration.ingest, dialect=dialect)
     return msgspec.structs.replace(configuration, ingest=ingest)
+
+
+def estimating(configuration: Any, estimator: str | None) -> Any:
+    """The settings, with another estimator.
+
+    Raises
+    ------
+    ValueError
+        There is none of that name.
+    """
+    import msgspec
+
+    if estimator is None:
+        return configuration
+    _check_estimator(estimator)
+    return msgspec.structs.replace(
+        configuration, estimate=msgspec.structs.replace(configuration.estimate, estimator=estimator)
+    )
+
+
+def _check_estimator(name: object) -> None:
+    if name not in get_args(Estimator):
+        raise ValueError(f"estimator {name!r} of [estimate]: it is one of {', '.join(get_args(Estimator))}")
+
+
+def configure_log(log: Path, path: Path | None, dialect: str | None, estimator: str | None) -> Any:
+    """Settings for a log or a sortie folder; None where those that ran there stand, or the usual ones.
+
+    An estimator alone replaces that of what ran, and nothing else.
+    """
+    if path or dialect:
+        return configure(path, dialect, estimator)
+    if estimator is None:
+        return None
+    return estimating(read_what_ran(log).configuration if log.is_dir() else configure(None), estimator)
 
 
 def _graded(given: dict[str, Any]) -> dict[str, Any]:

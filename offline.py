@@ -231,5 +231,5 @@ def smooth_log(
             sortie=output.stem,
             completeness=lambda: opened.completeness,
             interval=None,
-            properties=opened.properties,
+            properties=opened.properties | {"estimator": opened.configuration.estimate.estimator},
         )

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from bench import BENCHMARKS, REPRODUCTIONS
-from configuration import DISTRIBUTION, configure
-from live import Reception, follow, new_folder, record_lives, stop_on_signals
+from configuration import DISTRIBUTION, Estimator, configure, configure_log, read_what_ran
+from live import Reception, follow, make_prompt, new_folder, record_lives, stop_on_signals
 from offline import open_log, smooth_log
 from telling import Failure, counted, say, watch
 
@@ -45,6 +45,8 @@ class Receive:
         vehicles; may be given again.
     dialect
         MAVLink dialect, one that pymavlink ships; that of the settings if not given.
+    estimator
+        What filters and smooths, ms or cubature; that of the settings if not given.
     signing_key
         File with the key that frames must be signed with: a passphrase, or 64 hexadecimal digits.
     accept_unsigned
@@ -57,6 +59,7 @@ class Receive:
 
     forward: list[str] = field(default_factory=list)
     dialect: str | None = None
+    estimator: Estimator | None = None
     signing_key: Path | None = None
     accept_unsigned: bool = False
     resume: bool = False
@@ -64,13 +67,13 @@ class Receive:
 
     def begin(self, folder: Path, name: str, endpoints: Sequence[str], config: Path | None) -> Reception:
         """Listen, and archive what comes into the folder of a sortie."""
-        if self.resume and (config or self.dialect):
-            raise Failure("--resume goes on with the settings that ran, without --config and --dialect")
+        if self.resume and (config or self.dialect or self.estimator):
+            raise Failure("--resume goes on with the settings that ran, without --config, --dialect and --estimator")
         return Reception(
             folder,
             name,
             endpoints,
-            configure(config, self.dialect),
+            configure(config, self.dialect, self.estimator),
             forward=self.forward,
             resume=self.resume,
             signing_key=self.signing_key,
@@ -176,7 +179,14 @@ def ingest(
     reception.refuse_loss()
 
 
-def estimate(*, sortie: str, connect: str = BUS, credentials: Path | None = None, config: Path | None = None) -> None:
+def estimate(
+    *,
+    sortie: str,
+    connect: str = BUS,
+    credentials: Path | None = None,
+    config: Path | None = None,
+    estimator: Estimator | None = None,
+) -> None:
     """The second of three processes: samples to estimates and windows.
 
     Parameters
@@ -189,15 +199,19 @@ def estimate(*, sortie: str, connect: str = BUS, credentials: Path | None = None
         Folder of certificates, for a bus that leaves this machine.
     config
         TOML file with settings, the one that sortie ingest has: sortie verify goes by that.
+    estimator
+        What filters and smooths, ms or cubature, as told to sortie ingest; that of the settings if not given.
     """
-    import estimator.stage
+    from estimator.stage import estimate as run
+    from estimator.stage import warm_up
     from telemetry.bus import Bus, serve
 
-    configuration = configure(config)
-    estimator.stage.warm_up()
+    configuration = configure(config, estimator=estimator)
+    warm_up(configuration.estimate)
+    make_prompt()
 
     def stage(messages: Iterable[Message]) -> Iterator[Message]:
-        return estimator.stage.estimate(watch(messages, say, every=False), configuration.estimate, beside=True)
+        return run(watch(messages, say, every=False), configuration.estimate, beside=True)
 
     say(f"{sortie}: waiting for the bus on {connect}")
     with Bus(sortie, connect=[connect], credentials=credentials, role="estimate") as bus:
@@ -225,8 +239,13 @@ def record(
     resume
         Put the recordings in the place of those of before, which they hold too.
     """
+    import viewer
     from telemetry.bus import Bus
 
+    viewer.load()
+    import viewer.recorder  # now, and not when the first data wait for it
+
+    make_prompt()
     name, folder = new_folder(sortie, folder, shared=True)
     say(f"{name}: waiting for the bus on {connect}")
     with Bus(name, connect=[connect], credentials=credentials, role="record") as bus:
@@ -355,6 +374,7 @@ def smooth(
     test_points: Path | None = None,
     config: Path | None = None,
     dialect: str | None = None,
+    estimator: Estimator | None = None,
     bias_separation: bool = False,
     quiet: bool = False,
 ) -> None:
@@ -372,18 +392,22 @@ def smooth(
         TOML file with settings.
     dialect
         MAVLink dialect, one that pymavlink ships; that of the settings if not given.
+    estimator
+        What filters and smooths, ms or cubature; that of the settings, or of what ran in the folder, if not given.
     bias_separation
-        Also estimate biases and scale errors beside the states, as in Shi's eq. (17), and print both.
+        Also estimate biases and scale errors beside the states, as in Shi's eq. (17), and print both; of estimator ms.
     quiet
         Say nothing but the result.
     """
-    configuration = configure(config, dialect) if config or dialect else None
+    configuration = configure_log(log, config, dialect, estimator)
     output = output or Path(log.resolve().name).with_suffix(".rrd")
     points = []
     if test_points:
         from telemetry.marks import read
 
         points = read(test_points)
+    if bias_separation and _flying(configuration, log) != "ms":
+        raise Failure("--bias-separation looks at the stretches of estimator ms: give it with --estimator ms")
     witness = _witness() if bias_separation else None
     tell = None if quiet else say
     summary = smooth_log(log, output, configuration, tell, test_points=points, begun=witness)
@@ -400,6 +424,13 @@ def smooth(
         _separation(log, witness, tell)
     if not summary.windows:
         raise Failure(f"{log}: no satellite fix, so there is nothing to smooth; what could be read is in {output}")
+
+
+def _flying(configuration: Any, log: Path) -> str:
+    """The estimator that is going to smooth a log or sortie folder."""
+    if configuration is None:
+        configuration = read_what_ran(log).configuration if log.is_dir() else configure(None)
+    return str(configuration.estimate.estimator)
 
 
 def _witness() -> Any:
@@ -430,7 +461,7 @@ def _separation(log: Path, witness: Any, tell: Callable[[str], None] | None) -> 
         console.print(found.forms_table())
 
 
-def review(recording: Path, *, json: bool = False, plot: Path | None = None) -> None:
+def review(recording: Path, *, json: bool = False, plot: Path | None = None, against: Path | None = None) -> None:
     """Read a recording or a sortie folder back: what flew, what was lost, each window and why it closed.
 
     Parameters
@@ -441,10 +472,15 @@ def review(recording: Path, *, json: bool = False, plot: Path | None = None) -> 
         Print JSON instead of tables.
     plot
         Also draw a picture of it, a PNG.
+    against
+        Another recording of the same flight, e.g. by another --estimator: only tell how far apart their states are.
     """
     import msgspec
     from rich.console import Console
 
+    if against:
+        _agreement(recording, against, json)
+        return
     from viewer.report import tell
     from viewer.review import review as read_back
 
@@ -459,6 +495,20 @@ def review(recording: Path, *, json: bool = False, plot: Path | None = None) -> 
         tell(found, Console(soft_wrap=True))
         if plot:
             print(f"picture: {plot}")
+
+
+def _agreement(recording: Path, against: Path, json: bool) -> None:
+    """How far apart the states of two recordings are."""
+    import msgspec
+    from rich.console import Console
+
+    from viewer.agreement import agreement, tell
+
+    found = agreement(recording, against)
+    if json:
+        print(msgspec.json.format(msgspec.json.encode(found)).decode())
+    else:
+        tell(found, Console(soft_wrap=True))
 
 
 def verify(folder: Path) -> None:
@@ -490,7 +540,7 @@ def verify(folder: Path) -> None:
     for difference in differences:
         print(difference)
     if differences:
-        why = "if sortie estimate ran with another --config than sortie ingest, that is why"
+        why = "if sortie estimate ran with another --config or --estimator than sortie ingest, that is why"
         places = counted(len(differences), "place")
         raise Failure(f"{folder}: the recording and the replay of its raw log differ in {places}; {why}")
     if not counts["estimates"]:
@@ -615,7 +665,7 @@ def _dropout(text: str) -> tuple[str, float, float]:
     return sensor, start, stop
 
 
-def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED) -> None:
+def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED, estimator: Estimator | None = None) -> None:
     """Fly a simulated aircraft, record and smooth it live, and compare everything with the truth.
 
     Parameters
@@ -624,6 +674,8 @@ def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED) -> None:
         Where the sortie goes; sorties/demo-TIME if not given.
     speed
         Times real time; everything else is as in flight: the socket, the bus, the stages.
+    estimator
+        What filters and smooths, ms or cubature; ms if not given.
     """
     from rich.console import Console
 
@@ -651,7 +703,7 @@ def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED) -> None:
         sender.start()
 
     follow(
-        Reception(folder, name, [endpoint], configure(None)),
+        Reception(folder, name, [endpoint], configure(None, estimator=estimator)),
         name,
         folder,
         2.0,

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 import sims
+import sortie
 from telemetry.mavlink import Dialect
 from telemetry.sources.tlog import TlogSource
+from telling import Failure
 from tests.console import RERUN, Process, free_port, run
 from tests.telemetry.wire import DATA, Sender, tlog
 
@@ -213,6 +215,7 @@ def test_a_sortie_is_never_overwritten(tmp_path):
         (["smooth", "a.tlog", "--windw", "3"], "Unknown option"),
         (["sim", "--to", "udpout:1", "--speed", "fast"], "Invalid value"),
         (["mark", "begin", "12"], "Invalid value"),
+        (["smooth", "a.tlog", "--estimator", "magic"], 'Choose from: "ms", "cubature"'),
     ],
 )
 def test_wrong_usage_is_exit_code_two(arguments, words):
@@ -253,6 +256,29 @@ def test_settings_come_from_a_file_and_mistakes_in_it_are_named(log, tmp_path):
     done = run("smooth", log, "-o", "b.rrd", "--config", "bad.toml", cwd=tmp_path)
     assert done.returncode == 1
     assert "bad.toml: Expected `float`, got `str` - at `$.estimate.window`" in one_line(done)
+
+
+def test_another_estimator_is_flown_verified_and_compared(tmp_path):
+    port = free_port()
+    flight = sims.fly("c172x", "straight", duration=20)
+    told = ("--folder", "s", "--idle", 1.5, "--estimator", "cubature")
+    with Process("live", f"udpin:127.0.0.1:{port}", *told, cwd=tmp_path) as live:
+        live.wait_for("listening")
+        sims.send(sims.frames(flight), f"udpout:127.0.0.1:{port}", speed=20)
+        assert live.end() == 0, live.said
+    assert "flight path (cubature), mode G" in live.said
+    assert 'estimator = "cubature"' in (tmp_path / "s" / "sortie.toml").read_text()
+    verified = run("verify", "s", cwd=tmp_path)
+    assert verified.returncode == 0, verified.stdout + verified.stderr
+    done = run("smooth", "s", "-o", "ms.rrd", "--estimator", "ms", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(run("review", "s", "--against", "ms.rrd", "--json", cwd=tmp_path).stdout)
+    assert found["estimators"] == ["cubature", "ms"]
+    states = [state for state in found["states"] if state["stage"] == "live"]
+    assert {state["model"] for state in states} == {"trajectory", "flight_path"}
+    assert all(state["rows"] and state["rms_sigma"] < 1.0 for state in states)
+    with pytest.raises(Failure, match="--bias-separation looks at the stretches of estimator ms"):
+        sortie.smooth(tmp_path / "s", bias_separation=True)
 
 
 def test_a_test_point_is_marked_from_the_ground_while_live(tmp_path):

@@ -6,8 +6,9 @@ import threading
 
 import pytest
 
-from configuration import configure
+from configuration import configure, configure_log, write_what_runs
 from offline import ahead
+from telemetry.mavlink import Dialect
 from telling import Failure
 
 
@@ -59,3 +60,27 @@ def test_a_grade_that_does_not_exist_is_named(tmp_path):
     (tmp_path / "a.toml").write_text('[estimate.flight_path]\ngrade = "gold"\n')
     with pytest.raises(Failure, match=r"grade 'gold' of .* is one of autopilot, mems, fti"):
         configure(tmp_path / "a.toml")
+
+
+def test_an_estimator_is_told_by_the_file_or_in_its_place(tmp_path):
+    (tmp_path / "a.toml").write_text('[estimate]\nestimator = "cubature"\nwindow = 9.0\n')
+    assert configure(None).estimate.estimator == "ms"
+    assert configure(tmp_path / "a.toml").estimate.estimator == "cubature"
+    found = configure(tmp_path / "a.toml", estimator="ms").estimate
+    assert (found.estimator, found.window) == ("ms", 9.0)
+
+
+def test_an_estimator_that_does_not_exist_is_an_error_that_lists_those_that_do(tmp_path):
+    (tmp_path / "a.toml").write_text('[estimate]\nestimator = "magic"\n')
+    for told in ((tmp_path / "a.toml",), (None, None, "magic")):
+        with pytest.raises(Failure, match=r"estimator 'magic' of \[estimate\]: it is one of ms, cubature"):
+            configure(*told)
+
+
+def test_an_estimator_alone_leaves_the_other_settings_of_a_sortie_as_they_ran(tmp_path):
+    (tmp_path / "a.toml").write_text('[estimate]\nwindow = 9.0\nestimator = "cubature"\n')
+    ran = configure(tmp_path / "a.toml")
+    write_what_runs(tmp_path, "s", ["udpin:1"], [], ran, Dialect())
+    found = configure_log(tmp_path, None, None, "ms").estimate
+    assert (found.estimator, found.window) == ("ms", 9.0)
+    assert configure_log(tmp_path, None, None, None) is None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from viewer.columns import first, place, role
 from viewer.reading import Reading
+from viewer.review import estimator
 from viewer.states import order
 from viewer.summary import finite
 
@@ -62,7 +63,7 @@ class Agreement(msgspec.Struct, kw_only=True):
     files : list of str
         What was read, the first and the second.
     estimators : list of str
-        What made them, "" where a recording does not say.
+        What made them, "" where nothing says so.
     remarks : list of str
         What has to be known to read the figures.
     states : list of State
@@ -110,7 +111,7 @@ def agreement(path: str | Path, against: str | Path) -> Agreement:
             remarks.append("no estimate of one is of the same sample as one of the other: is it the same flight?")
         return Agreement(
             files=[str(path), str(against)],
-            estimators=[str(r.constant("/__properties/run", "estimator") or "") for r in (one, other)],
+            estimators=[estimator(reading) for reading in (one, other)],
             remarks=remarks,
             states=sorted(states, key=lambda s: (s.vehicle, first(s.model), s.stage, order(s.name))),
         )
@@ -172,8 +173,8 @@ def tell(found: Agreement, console: Console) -> None:
     from rich import box
     from rich.table import Table
 
-    for what, file, estimator in zip(("", "against "), found.files, found.estimators, strict=True):
-        by = f", estimator {estimator}" if estimator else ""
+    for what, file, name in zip(("", "against "), found.files, found.estimators, strict=True):
+        by = f", estimator {name}" if name else ""
         console.print(f"{what}{file}{by}", markup=False, highlight=False)
     for remark in found.remarks:
         console.print(f"  ! {remark}", markup=False, highlight=False, style="yellow")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import msgspec
@@ -30,7 +31,9 @@ from viewer.summary import (
 )
 from viewer.worth import Worth
 
-__all__ = ["Difference", "Line", "Reading", "Review", "column", "compare", "review"]
+__all__ = ["Difference", "Line", "Reading", "Review", "column", "compare", "estimator", "review"]
+
+_FLOWN = re.compile(r"trajectory model(?: \((\w+)\))? from satellite fixes")  # what a leg begins with in the log
 
 
 class Line(msgspec.Struct, kw_only=True):
@@ -86,6 +89,8 @@ def review(path: str | Path) -> Review:
         else:
             summary = _rebuilt(reading, log)
             reading.remarks.append("the recording was not closed cleanly: what follows was counted from its data")
+        if flown := estimator(reading, log):
+            summary.properties = summary.properties | {"estimator": flown}
         if Path(path).is_dir() and len(reading.files) == 1:
             reading.remarks.append("there is no windows.rrd: smoothed windows are missing")
         return Review(
@@ -97,6 +102,17 @@ def review(path: str | Path) -> Review:
         )
 
 
+def estimator(reading: Reading, log: list[Line] | None = None) -> str:
+    """Name of the estimator that made a recording, "" where nothing was estimated.
+
+    The log says who flew; what was to fly is known only where the recorder had been told.
+    """
+    named = reading.constant("/__properties/run", "estimator")
+    lines = _log(reading) if log is None else log
+    flown = [found[1] or "ms" for line in lines if (found := _FLOWN.search(line.text))]
+    return ", ".join(dict.fromkeys(flown)) or str(named or "")
+
+
 def _log(reading: Reading) -> list[Line]:
     (t,), (texts, levels) = reading.columns("/events", ("TextLog:text", "TextLog:level"), ("t_vehicle",))
     return [Line(t=int(a), level=str(b), text=str(c)) for a, b, c in zip(t, levels, texts, strict=True)]
@@ -105,12 +121,11 @@ def _log(reading: Reading) -> list[Line]:
 def _rebuilt(reading: Reading, log: list[Line]) -> Summary:
     """A summary from the data alone."""
     run = "/__properties/run"
-    estimator = reading.constant(run, "estimator")
     summary = Summary(
         sortie=str(reading.constant(run, "sortie") or ""),
         completeness="truncated" if reading.truncated else "not closed",
         gap=float(reading.constant(run, "gap") or 0.0),
-        properties={} if estimator is None else {"estimator": str(estimator)},
+        properties={},
         vehicles=[],
         accounts=[],
         byte_accounts=[],

@@ -19,8 +19,9 @@ import numpy as np
 
 from estimator.stage.beside import Beside
 from estimator.stage.epoch import TAKEN, Epoch
+from estimator.stage.estimators import Path
 from estimator.stage.settings import STAGE, Scope, Settings
-from estimator.stretch import Stretch
+from estimator.suspicion import delay
 from telemetry.messages import AirData, Altitude, Attitude, FlowAngles, Gnss, Imu, Mark, Message, Progress, Sample
 
 __all__ = ["STAGE", "Scope", "Settings", "estimate", "warm_up"]
@@ -32,7 +33,7 @@ def estimate(
     *,
     scope: Scope = "window",
     beside: bool = False,
-    begun: Callable[[Stretch], object] | None = None,
+    begun: Callable[[Path], object] | None = None,
 ) -> Iterator[Message]:
     """Estimate the state of every vehicle.
 
@@ -94,8 +95,14 @@ def _ended(messages: Iterable[Message]) -> Iterator[Message]:
         yield msgspec.structs.replace(last, final=True)
 
 
-def warm_up() -> None:
-    """Compile the stage by running it on a short flight, so that the first real one does not wait for it."""
+def warm_up(settings: Settings | None = None) -> None:
+    """Compile the stage by running it on a short flight, so that the first real one does not wait for it.
+
+    Parameters
+    ----------
+    settings : Settings, optional
+        Of the flight to come: what it does not fly is not compiled.
+    """
 
     def times(hertz: int, which: Any = slice(None)) -> dict[str, Any]:
         t = 1_000_000_000 // hertz * np.arange(1, 8 * hertz + 1)[which]
@@ -127,8 +134,11 @@ def warm_up() -> None:
         said(Mark, 7.0, action=["stop"], name=["TP"]),
     ]
     over = said(Progress, 1100.0, final=True)
+    chosen = settings or Settings()
+    short = Settings(window=3.0, model=chosen.model, estimator=chosen.estimator)
     flights: tuple[tuple[Scope, float], ...] = (("window", 7.9), ("sortie", 1.0))
     for scope, end in flights:
         until = [said(Progress, second, final=False) for second in np.arange(1.0, end, 0.5)]
-        for _ in estimate([*samples, *until, over], Settings(window=3.0), scope=scope):
+        for _ in estimate([*samples, *until, over], short, scope=scope):
             pass
+    delay.warm_up()

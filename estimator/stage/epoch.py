@@ -9,13 +9,14 @@ import numpy as np
 from estimator.arrivals import Arrivals, Place
 from estimator.drive import WIDTH
 from estimator.models.trajectory import Trajectory
+from estimator.stage import estimators
 from estimator.stage.beside import Beside
+from estimator.stage.estimators import Path
 from estimator.stage.flight import Flight
 from estimator.stage.rows import GNSS, KINDS, SENSORS, WITNESSES, rows
 from estimator.stage.settings import STAGE, Level, Reason, Scope, Settings
 from estimator.stage.sieve import Sieve
 from estimator.stage.trajectory import Leg
-from estimator.stretch import Stretch
 from estimator.synchronise import MARK, NEVER, Rows, concatenate, take
 from telemetry.messages import Altitude, Event, Gnss, Mark, Message, event
 
@@ -29,6 +30,7 @@ class Epoch:
     def __init__(self, vehicle: int, boot: int, settings: Settings, scope: Scope, beside: Beside) -> None:
         self.heard = np.iinfo(np.int64).max  # receive time of the first message
         self.vehicle, self.boot, self.settings, self.scope, self.beside = vehicle, boot, settings, scope, beside
+        self.estimator = estimators.named(settings.estimator)
         self._lag, self._output = round(settings.lag * 1e9), round(settings.output * 1e9)
         self._arrivals = Arrivals(SENSORS, GNSS, lag=self._lag, witnesses=WITNESSES)
         self._sieve = Sieve()
@@ -39,7 +41,7 @@ class Epoch:
         self.found: dict[str, list[tuple[float, float]]] = {}  # parameters of the test points so far: value, sigma
         self._number, self._test_point = 0, ""  # of the next leg's first window
         self._begun = False
-        self.begun: Callable[[Stretch], object] | None = None  # told of every flight path that begins
+        self.begun: Callable[[Path], object] | None = None  # told of every flight path that begins
         self._samples, self._t, self._t_rx = 0, np.iinfo(np.int64).min, np.iinfo(np.int64).min
         self._waits = NEVER  # least time of what the trajectory has not used yet
         self._worked = -NEVER  # receive time up to which everything has been worked on
@@ -102,7 +104,7 @@ class Epoch:
                 fix = int(np.flatnonzero(piece.rows.sensor == GNSS)[0])
                 yield self.event(
                     "info",
-                    f"trajectory model from satellite fixes and altimeter, origin "
+                    f"trajectory model{self.by} from satellite fixes and altimeter, origin "
                     f"{np.rad2deg(piece.origin[0]):.5f} {np.rad2deg(piece.origin[1]):.5f} deg, "
                     f"{piece.origin[2]:.0f} m",
                     int(piece.rows.t[fix]),
@@ -186,6 +188,11 @@ class Epoch:
             pass  # told already: the window is lost
         yield from self._land("gap", leg.at_rx)
         self._leg, self._number, self._test_point = None, leg.number, leg.test_point
+
+    @property
+    def by(self) -> str:
+        """Words for the estimator, if it is not the usual one."""
+        return "" if self.settings.estimator == "ms" else f" ({self.settings.estimator})"
 
     def event(self, level: Level, text: str, t: int, t_rx: int) -> Event:
         """One event about this vehicle."""

@@ -29,7 +29,7 @@ from estimator.stage.passage import Closed, Passage
 from estimator.stage.report import Known, Sum, test_point_report
 from estimator.stage.rows import AIR, GNSS, SENSORS
 from estimator.stage.settings import Level, Reason
-from estimator.stretch import Diverged, Filtered, Smoothed, Stretch
+from estimator.stretch import Diverged, Filtered, Smoothed
 from estimator.synchronise import MARK, Rows, Synchroniser, Watermark, concatenate, take
 from telemetry.messages import Message
 
@@ -296,7 +296,7 @@ class Flight:
 
     def _take_off(self, flight: FlightPath, begin: Samples, found: alignment.Start) -> Iterator[Message]:
         t = int(begin.t[-1])
-        stretch = Stretch(flight, flight.start(found.values, found.sigma))
+        stretch = self.epoch.estimator.begin(flight, found.values, found.sigma)
         if self.epoch.begun is not None:
             self.epoch.begun(stretch)
         driver = Driver(
@@ -308,7 +308,7 @@ class Flight:
         self._told.clear()
         yield self.epoch.event(
             "warning" if found.doubtful else "info",
-            f"flight path, mode {flight.settings.mode}, {flight.n} states: inertial samples at "
+            f"flight path{self.epoch.by}, mode {flight.settings.mode}, {flight.n} states: inertial samples at "
             f"{1 / found.period:.1f} Hz, {found.text}, satellite fixes taken as {self.delay:.2f} s old",
             t,
             int(begin.t_rx[-1]),

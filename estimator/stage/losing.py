@@ -17,9 +17,10 @@ from estimator.models.flight_path import PARAMETERS
 from estimator.stage.examining import absent
 from estimator.stage.rows import AIR, ALTITUDE, FLOW, GNSS, INERTIAL
 from estimator.stage.rows import ATTITUDE as ANGLES
-from estimator.stretch import Smoothed, Stretch
+from estimator.stretch import Smoothed
 
 if TYPE_CHECKING:
+    from estimator.stage.estimators import Path
     from estimator.stage.passage import Closed, Passage
 
 Floats = NDArray[np.float64]
@@ -33,7 +34,7 @@ CHANNELS = {
 }  # fmt: skip
 
 
-def alone(passage: Passage, window: Closed, smoothed: Smoothed) -> tuple[Stretch, Drive, Told]:
+def alone(passage: Passage, window: Closed, smoothed: Smoothed) -> tuple[Path, Drive, Told]:
     """A stretch that begins where a window did, knowing nothing but the priors, and what drives it through the window.
 
     Begun where the smoothed path passes; what the gate decided on the way stays decided.
@@ -46,7 +47,7 @@ def alone(passage: Passage, window: Closed, smoothed: Smoothed) -> tuple[Stretch
         for name, value in zip(flight.names, smoothed.mean[window.first], strict=True)
         if name not in PARAMETERS
     }
-    return Stretch(flight, flight.start(values), gated=False), drive, told
+    return passage.estimator.begin(flight, values, gated=False), drive, told
 
 
 def loss_effect(

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,9 +17,10 @@ from estimator.drive import IMPACT, MEASURED, Driver, Samples, Steps, merged
 from estimator.extended import REJECTED
 from estimator.kinematics import MEASUREMENTS, M
 from estimator.models.flight_path import MODEL, FlightPath
+from estimator.stage.estimators import Estimator, Path
 from estimator.stage.rows import SENSORS
-from estimator.stage.settings import STAGE, Reason
-from estimator.stretch import Diverged, Filtered, Point, Smoothed, Stretch
+from estimator.stage.settings import STAGE, Reason, fingerprint
+from estimator.stretch import Diverged, Filtered, Smoothed
 from estimator.synchronise import Rows
 from estimator.ud import compiled
 from telemetry.messages import Estimate, Event, Window
@@ -56,7 +56,7 @@ class _Opening(NamedTuple):
     """Everything as it was when the window was opened."""
 
     t: int
-    point: Point
+    point: Any
     driver: Driver
     left: Floats
     steps: int
@@ -117,7 +117,7 @@ class Passage:
     """
 
     def __init__(
-        self, flight: Flight, model: FlightPath, stretch: Stretch, driver: Driver, t: int, t_rx: int,
+        self, flight: Flight, model: FlightPath, stretch: Path, driver: Driver, t: int, t_rx: int,
     ) -> None:  # fmt: skip
         self._leg, self.flight, self.stretch, self.driver = flight, model, stretch, driver
         self.last = (t, t_rx)
@@ -128,7 +128,7 @@ class Passage:
         self.closed: list[Closed] = []
         self._left = np.zeros(2)
         self._steps = 0  # since the stretch was last forgotten
-        self._configuration = msgspec.json.encode(flight.epoch.settings)
+        self._configuration = fingerprint(flight.epoch.settings)
         self._window: Closed | None = None
         self._opening: _Opening | None = None
         self._log: list[Samples] = []  # since then
@@ -150,6 +150,11 @@ class Passage:
         if len(samples.t):
             self._log.append(samples)
         return self.driver.push(samples)
+
+    @property
+    def estimator(self) -> Estimator:
+        """What flies it."""
+        return self._leg.epoch.estimator
 
     def air(self) -> bool:
         """Whether an airspeed has come since the window was opened."""

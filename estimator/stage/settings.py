@@ -13,6 +13,7 @@ Seconds = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
 Scope = Literal["window", "sortie"]
 Level = Literal["info", "warning", "error"]
 Reason = Literal["mark", "gap", "length", "reboot", "end"]
+Name = Literal["ms", "cubature"]  # of an estimator, as in ``estimators``
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,8 +40,11 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     model : {"auto", "trajectory", "flight_path"}
         "auto" flies the flight path wherever the sensors allow, "flight_path" too and warns where they do not; the
         trajectory, which gives the position, is always flown.
+    estimator : {"ms", "cubature"}
+        What filters and smooths both models: the information filter and smoother in moving coordinates, or the
+        square-root cubature filter and smoother. Windows, marks and reports are the same.
     iterate : int
-        Hybrid passes over a whole sortie; 0 leaves the extended smoother's result.
+        Hybrid passes of "ms" over a whole sortie; 0 leaves the extended smoother's result.
     trajectory : estimator.models.trajectory.Settings
     flight_path : estimator.models.flight_path.Settings
     """
@@ -53,6 +57,18 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     test_point: Seconds = 600.0
     output: Seconds = 0.04
     model: Literal["auto", "trajectory", "flight_path"] = "auto"
+    estimator: Name = "ms"
     iterate: Annotated[int, msgspec.Meta(ge=0, le=10)] = 1
     trajectory: trajectory.Settings = trajectory.Settings()
     flight_path: flight_path.Settings = flight_path.Settings()
+
+
+def fingerprint(settings: Settings) -> bytes:
+    """What the digest of a window begins with: the settings as JSON.
+
+    An estimator is named in it only where it is not "ms", which is what a digest without one has always meant.
+    """
+    told: dict[str, object] = msgspec.to_builtins(settings)
+    if settings.estimator == "ms":
+        del told["estimator"]
+    return msgspec.json.encode(told)

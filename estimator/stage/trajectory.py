@@ -12,14 +12,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.information import Carry, anchor, filter, start
 from estimator.model import LinearModel
 from estimator.models import trajectory
 from estimator.models.trajectory import Trajectory
-from estimator.smoother import backward
-from estimator.snapshots import Store
+from estimator.stage.estimators import Store
 from estimator.stage.rows import ALTITUDE, FIX_VELOCITY, GNSS, HEIGHT_COLUMN, SENSORS
-from estimator.stage.settings import STAGE, Reason
+from estimator.stage.settings import STAGE, Reason, fingerprint
 from estimator.synchronise import MARK, Rows, Steps, Synchroniser, take
 from estimator.window import Rule
 from telemetry.messages import Estimate, Event, Message, Window
@@ -64,10 +62,11 @@ class Leg:
         self._marks: list[tuple[str, str]] = []
         self._late: list[tuple[int, int]] = []
         self._rule = Rule(scale=np.array(trajectory.SCALE))
-        self._store = Store()
-        self._carry: Carry = start(trajectory.N, model.x0, model.p0)
+        self._use = epoch.estimator
+        self._store: Store = self._use.store()
+        self._carry = self._use.start(trajectory.N, model.x0, model.p0)
         self._std = self._std_measured = np.full(trajectory.N, np.inf)  # after the last step, and the last measured one
-        self._configuration = msgspec.json.encode(settings)
+        self._configuration = fingerprint(settings)
         self._closed: list[Window] = []  # waiting for the end of the leg
         self._released = np.empty(0, np.int64)  # times of the measurements at hand
         self._window = self._open(test_point)
@@ -174,7 +173,7 @@ class Leg:
         before = len(self._store.anchors)
         chunk = LinearModel(phi, gamma, q, self._model.observation(steps.r), steps.r)
         try:
-            self._carry, live = filter(chunk, self._carry, steps.z, rule=self._rule, store=self._store)
+            self._carry, live = self._use.filter(chunk, self._carry, steps.z, rule=self._rule, store=self._store)
         except (ValueError, ArithmeticError):
             if len(steps.t) == 1:
                 self.at, self.at_rx = (
@@ -259,12 +258,12 @@ class Leg:
         self._late = [item for item in self._late if item[0] > when]
         closed = self._message(window, reason, dict(late))
         if self._epoch.scope == "window":
-            mean, std, *_ = backward(self._store, self._carry, std=True, covariance=False)
+            mean, std = self._use.smooth(self._store, self._carry)
             yield self._smoothed(closed, mean[1:], std[1:])
             self._store.drop(len(self._store))
         else:
             self._closed.append(closed)
-        self._carry = anchor(self._carry)
+        self._carry = self._use.anchor(self._carry)
         self.number += 1
         # A test point that a silence or its length cuts in two stays one until it is stopped.
         self._window = self._open(window.test_point if reason in ("gap", "length") else "")
@@ -300,7 +299,7 @@ class Leg:
         """One smoothing of the whole leg, told window by window."""
         if not self._closed:
             return
-        mean, std, *_ = backward(self._store, self._carry, std=True, covariance=False)
+        mean, std = self._use.smooth(self._store, self._carry)
         first = 1
         for closed in self._closed:
             last = first + len(closed.t)
