@@ -479,6 +479,8 @@ def review(recording: Path, *, json: bool = False, plot: Path | None = None, aga
     from rich.console import Console
 
     if against:
+        if plot:
+            raise Failure("--against compares two recordings in figures: --plot draws one, without it")
         _agreement(recording, against, json)
         return
     from viewer.report import tell

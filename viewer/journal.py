@@ -10,6 +10,7 @@ thousands of rows of an entity into a chunk, is a fraction as large, and takes t
 from __future__ import annotations
 
 import os
+import shutil
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,6 +26,7 @@ ROWS = 8192  # rows, or points of lines, in one chunk of what lasts
 PIECES = 64  # that wait side by side before they are laid end to end
 PHASES = 64  # entities of one rate fill their chunks in turn, not all at one moment
 SUFFIX = ".finishing"
+RESERVE = 256 << 20  # bytes of free space below which the disk is left to what grows, and to the raw log
 
 
 def indexed(path: Path) -> bool:
@@ -36,6 +38,14 @@ def indexed(path: Path) -> bool:
         except (RuntimeError, ValueError, OSError):
             return False
     return True
+
+
+def _free(path: Path) -> float:
+    """Free space of the disk, bytes; endless where nobody knows."""
+    try:
+        return shutil.disk_usage(path.parent).free
+    except OSError:
+        return float("inf")
 
 
 class _Rows:
@@ -127,6 +137,7 @@ class Journal(Sink):
         join: int | None = None,
     ) -> None:
         self._whole: _Whole | None = None
+        self._given_up = False  # what would have lasted, before the end
         super().__init__(path, sortie, on_alarm, serve=serve, join=join, index=False)
         self._whole = _Whole(path.with_name(path.name + SUFFIX), sortie, on_alarm)
         self._blueprint: Any = None
@@ -206,13 +217,17 @@ class Journal(Sink):
         self._blueprint = blueprint
 
     def sync(self, timeout: float = 10.0) -> Callable[[], bool]:
-        """As of `Sink`. Where it fails, what would have lasted leaves its room to what is there."""
+        """As of `Sink`. Where it fails, what would have lasted leaves its room to what is there; and before it fails,
+        because a file that could not be written once cannot be written any more.
+        """
         growing, whole = super().sync(timeout), self._whole
         lasting = None if whole is None else whole.sink.sync(timeout)
+        narrow = whole is not None and _free(self.path) < RESERVE
 
         def settle() -> bool:
             done = growing()
-            if lasting is not None and self._whole is whole and not (done and lasting()):
+            if lasting is not None and self._whole is whole and (not (done and lasting()) or narrow):
+                self._given_up = True
                 self._abandon()
             return done
 
@@ -239,6 +254,11 @@ class Journal(Sink):
                     f"{self.path}: could not be finished; it holds everything, without an index: "
                     f"rerun rrd optimize {self.path} -o FILE writes one"
                 )
+        elif self._given_up and done:  # where writing fails to the end, that has been told
+            self._on_alarm(
+                f"{self.path}: for want of room, or because writing failed, it has no index: "
+                f"rerun rrd optimize {self.path} -o FILE writes one"
+            )
         return done
 
     def _keep(self, write: Callable[..., None], entity: str, t: Times, t_rx: Times, rows: list[Floats]) -> None:

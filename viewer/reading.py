@@ -70,7 +70,7 @@ class Reading:
         if not chunks:
             self.remarks.append(f"{file.name} holds nothing")
         elif not footer and not self.truncated:
-            self.remarks.append(f"{file.name} has no index: its writer stopped without finishing it")
+            self.remarks.append(f"{file.name} has no index: its writer was stopped, or gave it up")
         for chunk in chunks:
             self.chunks.setdefault(chunk.entity_path, []).append(chunk)
 

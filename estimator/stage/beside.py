@@ -20,7 +20,7 @@ BACKLOG = 16  # jobs that may wait: beyond that the flight waits for them, and m
 
 
 class Beside:
-    """Does jobs in the order they are given: at once, or on a thread of their own.
+    """Does jobs in the order they are given: at once, or on a thread of their own; questions on another.
 
     Parameters
     ----------
@@ -30,6 +30,7 @@ class Beside:
 
     def __init__(self, thread: bool) -> None:
         self._pool = ThreadPoolExecutor(1, "beside") if thread else None
+        self._asked = ThreadPoolExecutor(1, "asked") if thread else None  # an answer is due sooner than a long window
         self._waiting: deque[Future[list[Message]]] = deque()
 
     def run(self, job: Job) -> Iterator[Message]:
@@ -43,10 +44,10 @@ class Beside:
 
     def ask(self, question: Callable[[], T]) -> Callable[[], T]:
         """Have a question answered; gives back what waits for the answer."""
-        if self._pool is None:
+        if self._asked is None:
             answer = question()
             return lambda: answer
-        return self._pool.submit(question).result
+        return self._asked.submit(question).result
 
     def done(self, *, all: bool = False) -> Iterator[Message]:
         """What finished jobs have to say; with `all`, after waiting for those that are not finished."""
@@ -55,8 +56,9 @@ class Beside:
 
     def close(self) -> None:
         """Give up what has not begun."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        for pool in (self._pool, self._asked):
+            if pool is not None:
+                pool.shutdown(cancel_futures=True)
 
 
 def _whole(job: Job) -> list[Message]:

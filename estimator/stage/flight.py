@@ -476,9 +476,22 @@ class Flight:
             self.sum.add(passage, window, smoothed)
             yield passage.message(window, smoothed)
             if window.test_point:
-                yield test_point_report(self.epoch, passage, window, smoothed, known)
+                told: Message
+                try:
+                    told = test_point_report(self.epoch, passage, window, smoothed, known)
+                except (ValueError, ArithmeticError) as error:
+                    text = f"test point {window.test_point} is smoothed, but could not be reported: {error}"
+                    told = self.epoch.event("error", text, *Sum.last(window))
+                yield told
 
     def _total(self, known: Known) -> Iterator[Message]:
         """What the windows add up to, once they have been smoothed."""
-        if self.sum.flight is not None:
-            yield self.sum.report(self.epoch, known)
+        if self.sum.flight is None:
+            return
+        told: Message
+        try:
+            told = self.sum.report(self.epoch, known)
+        except (ValueError, ArithmeticError) as error:
+            text = f"the flight path is smoothed, but could not be reported as a whole: {error}"
+            told = self.epoch.event("error", text, *self.sum.end)
+        yield told

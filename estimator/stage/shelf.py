@@ -43,6 +43,24 @@ class _Filed(NamedTuple):
     last: int
 
 
+class _File:
+    """A file that has no name, closed when nobody reads it any more.
+
+    Raises
+    ------
+    OSError
+        It cannot be made.
+    """
+
+    def __init__(self) -> None:
+        with tempfile.TemporaryFile(prefix="sortie-") as file:
+            self.number = os.dup(file.fileno())
+
+    def __del__(self) -> None:
+        if hasattr(self, "number"):
+            os.close(self.number)
+
+
 class Shelf:
     """Rows of one sensor.
 
@@ -54,7 +72,7 @@ class Shelf:
 
     def __init__(self, width: int) -> None:
         self._width = width
-        self._file: int | None = None
+        self._file: _File | None = None
         self._filed: list[_Filed] = []
         self._size = 0
         self._loose: list[Rows] = []
@@ -70,7 +88,7 @@ class Shelf:
     def so_far(self) -> Shelf:
         """The same rows, to be read in another thread while more are put here."""
         other = Shelf(self._width)
-        other._file = None if self._file is None else os.dup(self._file)
+        other._file = self._file  # read by place: who reads where does not matter to the others
         other._filed, other._loose = list(self._filed), list(self._loose)
         return other
 
@@ -95,10 +113,13 @@ class Shelf:
 
     def _read(self, part: _Filed, width: int) -> Rows:
         assert self._file is not None
-        data = os.pread(self._file, 8 * part.size * (2 + width), part.offset)
-        words = np.frombuffer(data, np.int64)
-        if len(words) != part.size * (2 + width):
+        try:
+            data = os.pread(self._file.number, 8 * part.size * (2 + width), part.offset)
+        except OSError as error:
+            raise ArithmeticError(f"what the sensors said could not be read back: {error}") from None
+        if len(data) != 8 * part.size * (2 + width):
             raise ArithmeticError("what the sensors said could not be read back from the temporary file")
+        words = np.frombuffer(data, np.int64)
         t, passed = words[: part.size], words[part.size : 2 * part.size]
         return Rows(t, passed, words[2 * part.size :].view(np.float64).reshape(part.size, width))
 
@@ -109,16 +130,11 @@ class Shelf:
         data = b"".join(np.ascontiguousarray(column).tobytes() for column in rows)
         try:
             if self._file is None:
-                with tempfile.TemporaryFile(prefix="sortie-") as file:
-                    self._file = os.dup(file.fileno())
-            if os.pwrite(self._file, data, self._size) < len(data):
+                self._file = _File()
+            if os.pwrite(self._file.number, data, self._size) < len(data):
                 return  # the disk is full: what was begun will be written over
         except OSError:
             return
         self._filed.append(_Filed(self._size, len(rows.t), int(rows.t.min()), int(rows.t.max())))
         self._size += len(data)
         self._loose = []
-
-    def __del__(self) -> None:
-        if self._file is not None:
-            os.close(self._file)

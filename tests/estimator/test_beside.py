@@ -96,3 +96,32 @@ def test_what_fails_for_other_reasons_is_raised_where_the_flight_is(flight, monk
     monkeypatch.setattr(Stretch, "smooth", broken)
     with pytest.raises(TypeError, match="a mistake"):
         list(estimate(flight[0], flight[1], beside=True))
+
+
+def test_a_report_that_fails_is_told_alike_and_its_windows_stand(flight, monkeypatch):
+    def broken(*_):
+        raise ArithmeticError("unreadable")
+
+    monkeypatch.setattr("estimator.stage.flight.test_point_report", broken)
+    monkeypatch.setattr("estimator.stage.report.Sum.report", broken)
+    outs = [list(estimate(flight[0], flight[1], beside=beside)) for beside in (False, True)]
+    for out in outs:
+        texts = [text for message in told(out, Event) for text in message.text]
+        assert sum(text.endswith("is smoothed, but could not be reported: unreadable") for text in texts) == 2
+        assert texts[-1] == "the flight path is smoothed, but could not be reported as a whole: unreadable"
+    windows = [[encode(m) for m in told(out, Window)] for out in outs]
+    assert windows[0] == windows[1] and len(windows[0]) >= 3
+
+
+def test_a_question_does_not_wait_for_windows():
+    beside, go = Beside(True), threading.Event()
+
+    def job():
+        assert go.wait(60.0)
+        return ()
+
+    assert list(beside.run(job)) == []
+    assert beside.ask(lambda: 3)() == 3
+    go.set()
+    assert list(beside.done(all=True)) == []
+    beside.close()

@@ -140,6 +140,16 @@ def test_what_cannot_be_finished_stays_as_it_has_grown_and_is_told(tmp_path, mon
     assert indexed(tmp_path / "way_out.rrd")
 
 
+def test_where_the_disk_is_nearly_full_all_of_it_is_left_to_what_grows(tmp_path, monkeypatch):
+    path, heard = tmp_path / "x.rrd", []
+    monkeypatch.setattr(journal, "RESERVE", 1 << 62)
+    summary = record(f.batched(f.flight(), 4.0), path, sortie="x", interval=4.0, on_alarm=heard.append)
+    assert summary.completeness == "complete"
+    assert len(heard) == 1 and "for want of room" in heard[0] and f"rerun rrd optimize {path}" in heard[0]
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    assert review(path).closed
+
+
 def test_memory_does_not_grow_with_what_has_been_recorded(tmp_path):
     done = python(f"""
 import os
