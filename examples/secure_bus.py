@@ -47,21 +47,25 @@ def main() -> None:
 
 
 def fly(endpoint: str, folder: Path) -> None:
-    """Three roles at work, and a viewer who tries to speak for one of them."""
+    """Three roles at work, and another viewer who tries to speak for one of them."""
     with (
         Bus("example", connect=[endpoint], credentials=folder, role="ingest") as ingest,
         Bus("example", connect=[endpoint], credentials=folder, role="estimate") as estimate,
         Bus("example", connect=[endpoint], credentials=folder, role="viewer") as viewer,
+        Bus("example", connect=[endpoint], credentials=folder, role="viewer") as forger,
     ):
-        forged = viewer.publisher("ingest")
+        forged = forger.publisher("ingest")
         forged.put(event("forged", t=0, t_rx=0))
         subscription = viewer.subscribe("viewer", ["ingest", "estimate"])  # first: nobody waits long for who looks on
+        listening = threading.Event()
+        started = {"started": lambda _: listening.set()}
         told = [
+            threading.Thread(target=serve, args=(estimate, "estimate", ["ingest"], iter), kwargs=started),
             threading.Thread(target=publish, args=(ingest, "ingest", words())),
-            threading.Thread(target=serve, args=(estimate, "estimate", ["ingest"], iter)),
         ]
-        for thread in told:
-            thread.start()
+        told[0].start()
+        listening.wait(30)  # who has said his last and has been heard goes, and is not there for those who come later
+        told[1].start()
         heard = [message for message in subscription if isinstance(message, Event)]
         subscription.close()
         for thread in told:

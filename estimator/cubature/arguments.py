@@ -105,6 +105,8 @@ def wrapped_components(angles: Sequence[int], m: int) -> Any:
     """(m,) bool: True where a component of z is an angle."""
     turns = np.zeros(m, np.bool_)
     for component in angles:
+        if isinstance(component, bool | np.bool_):
+            raise ValueError("angles is a mask: the numbers of the components are needed")
         if not 0 <= component < m:
             raise ValueError(f"angles names component {component}: z has components 0 to {m - 1}")
         turns[component] = True

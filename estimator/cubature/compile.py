@@ -57,6 +57,10 @@ class Kernel:
 
 
 def _returns(model: Any, takes: tuple[Any, ...]) -> Any:
+    """What it returns; None where it is compiled for other arguments only, or has more, which have defaults."""
     if takes not in model.overloads:
-        model.compile(takes)
+        try:
+            model.compile(takes)
+        except (RuntimeError, TypeError):
+            return None
     return model.overloads[takes].signature.return_type

@@ -45,7 +45,7 @@ from estimator.cubature.arrays import (
 )
 from estimator.cubature.compile import woven
 from estimator.cubature.models import FINE, INFINITE, SHAPE, images
-from estimator.cubature.reflections import Array, annihilate
+from estimator.cubature.reflections import Array, annihilate, echelon
 from estimator.ud import follow
 
 __all__ = [
@@ -249,6 +249,8 @@ def relinearise(
     of_f, of_h, n, k, m = work.f, work.h, mean.size, work.predicted.size, abs(count)
     for iteration in range(0 if count == 0 else iterations):
         if status == FINE:
+            echelon(work.earlier_root, work.stack)
+            echelon(work.filtered_root, work.predicted_root)
             status = transform(f, u, work.earlier, work.earlier_root, work.f)
         if status == FINE:
             status = observe(h, u, work.filtered, work.filtered_root, count, turns, work.present, work.h)

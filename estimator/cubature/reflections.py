@@ -140,6 +140,50 @@ def reduce(a: Array, rows: int, first: int, width: int) -> None:
 
 
 @strict
+def echelon(root: Array, rows: Array) -> None:
+    """Bring a singular factor to the form in which a pivot that is rounding has an empty column; else leave it.
+
+    Under such a pivot may stand what is known of later states. It goes to their own pivots, by which a regression can
+    divide. ``rows`` is scratch of as many rows and columns.
+    """
+    n = root.shape[0]
+    few = NULL * n * np.finfo(root.dtype).eps
+    singular = False
+    for j in range(n):
+        norm = 0.0
+        for i in range(j + 1):
+            norm += root[j, i] * root[j, i]
+        singular = singular or root[j, j] <= few * np.sqrt(norm)
+    if not singular:
+        return
+    for i in range(n):
+        for j in range(n):
+            rows[j, i] = root[i, j] if j <= i else 0.0
+    rank = n - n
+    for j in range(n):
+        before, pivot = 0.0, 0.0
+        for i in range(rank):
+            before += rows[i, j] * rows[i, j]
+        for i in range(rank, n):
+            pivot += rows[i, j] * rows[i, j]
+        if np.sqrt(pivot) <= few * np.sqrt(before + pivot):
+            for i in range(rank, n):
+                rows[i, j] = 0.0
+        else:
+            reflect(rows, rank, rows, rank + 1, n, j, n)
+            rank += 1
+    for i in range(n):
+        for j in range(n):
+            root[i, j] = 0.0
+    for i in range(rank):
+        first = i
+        while first < n - 1 and rows[i, first] == 0.0:
+            first += 1
+        for j in range(first, n):
+            root[j, first] = rows[i, j]
+
+
+@strict
 def annihilate(top: Array, below: Array, rows: int, count: int, width: int, floor: Array, drop: float) -> int:
     """Reflect ``below[:rows]`` into the triangle ``top`` (count, width): its first ``count`` columns become zero.
 

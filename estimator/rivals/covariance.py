@@ -289,7 +289,7 @@ def sigma_kernels(f: Model, h: Model) -> Kernels:
         points, values = np.empty((2 * n + 1, n), mean.dtype), np.zeros((2 * n + 1, n), mean.dtype)
         spread(mean, s, kappa, points)
         for i in range(first, 2 * n + 1):
-            values[i] = f(points[i])
+            values[i] = f(points[i].copy())  # which a model may write on
         if not finite(values):
             return LOST_F
         moments(points, mean, values, sqrt_q, kappa, x, p, cross)
@@ -309,7 +309,7 @@ def sigma_kernels(f: Model, h: Model) -> Kernels:
         spread(x, s, kappa, points)
         turning = circular.any()
         for i in range(0 if turning else first, 2 * n + 1):
-            values[i] = h(points[i])
+            values[i] = h(points[i].copy())
             if turning:
                 turned(values[i], values[0], circular)
         if not finite(values):
@@ -328,6 +328,10 @@ def filtered(
     """Run ``kernels.step`` on arrays of any kind and raise what it says."""
     x, s, q, r = arrays(mean, sqrt_cov, sqrt_q, sqrt_r)
     measured = np.full(len(r), np.nan, x.dtype) if z is None else np.array(z, x.dtype)
+    fits(name, "sqrt_cov", s, (x.size, x.size))
+    fits(name, "sqrt_q", q, (x.size, q.shape[-1]))
+    fits(name, "sqrt_r", r, (measured.size, r.shape[-1]))
+    fits(name, "z", measured, (len(r),))
     circular = np.zeros(len(r), bool)
     circular[list(angles)] = True
     out, to = np.empty_like(x), np.empty_like(s)
@@ -341,6 +345,10 @@ def smoothed(
 ) -> tuple[Array, Array]:  # fmt: skip
     """Run ``kernels.smooth`` on arrays of any kind and raise what it says."""
     x, s, q, ahead, ahead_s = arrays(mean, sqrt_cov, sqrt_q, next_mean, next_sqrt_cov)
+    fits(name, "sqrt_cov", s, (x.size, x.size))
+    fits(name, "sqrt_q", q, (x.size, q.shape[-1]))
+    fits(name, "next_mean", ahead, x.shape)
+    fits(name, "next_sqrt_cov", ahead_s, s.shape)
     out, to = np.empty_like(x), np.empty_like(s)
     check(kernels.smooth(x, s, q, ahead, ahead_s, kappa, out, to), name, (model, model))
     return out, to
@@ -350,6 +358,12 @@ def arrays(mean: ArrayLike, *others: ArrayLike) -> list[Array]:
     """Contiguous arrays of the precision of the mean: float32 if it is that, float64 otherwise."""
     dtype = np.float32 if np.asarray(mean).dtype == np.float32 else np.float64
     return [np.ascontiguousarray(each, dtype) for each in (mean, *others)]
+
+
+def fits(name: str, what: str, array: Array, shape: tuple[int, ...]) -> None:
+    """ValueError where an array has not the shape that the compiled loops go by."""
+    if array.shape != shape:
+        raise ValueError(f"{name}: {what} has shape {array.shape}, not {shape}")
 
 
 def check(status: int, name: str, models: tuple[Model, Model]) -> None:

@@ -78,9 +78,9 @@ def differences(model: Model) -> Slope:
             high = moved.dtype.type(x[j] + by)
             low = moved.dtype.type(x[j] - by)
             moved[j] = high
-            up[:] = model(moved)
+            up[:] = model(moved.copy())
             moved[j] = low
-            down[:] = model(moved)
+            down[:] = model(moved.copy())
             moved[j] = x[j]
             if circular.size > 0:
                 turned(up, value, circular)
@@ -98,7 +98,7 @@ def _given(function: Model) -> Slope:
     @specialised(function, part=True)
     def jacobian(x: Array, sigma: Array, value: Array, circular: Mask) -> Array:
         out = np.empty((value.size, x.size), x.dtype)
-        out[:, :] = function(x)
+        out[:, :] = function(x.copy())
         return out
 
     return jacobian
@@ -113,7 +113,7 @@ def kernels(f: Model, h: Model, f_jacobian: Model | None = None, h_jacobian: Mod
     @specialised(f, slope_f, part=True)
     def predict(mean: Array, s: Array, sqrt_q: Array, _: float, x: Array, p: Array, cross: Array) -> int:
         n = mean.size
-        x[:] = f(mean)
+        x[:] = f(mean.copy())
         if not finite(x):
             return LOST_F
         before, sigma = np.zeros((n, n), mean.dtype), np.empty(n, mean.dtype)
@@ -135,7 +135,7 @@ def kernels(f: Model, h: Model, f_jacobian: Model | None = None, h_jacobian: Mod
             p1[:, :] = p
             return FINE
         predicted, sigma = np.empty(m, x.dtype), np.empty(n, x.dtype)
-        predicted[:] = h(x)
+        predicted[:] = h(x.copy())
         if not finite(predicted):
             return LOST_H
         for i in range(n):

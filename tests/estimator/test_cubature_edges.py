@@ -55,6 +55,39 @@ def test_a_state_that_is_known_stays_known(step):
     assert mean[0] == pytest.approx(1.0, abs=1e-12) and abs(root[0]).max() < 1e-12 and 2.0 < mean[1] < 3.5
 
 
+SINGULAR = {  # mean, factor, phi, h, sqrt_q: all leave a state without a pivot of its own
+    "noise on the second": ([0.0, 0.0], np.zeros((2, 2)), I2, [[0.0, 1.0]], [[0.0], [1.0]]),
+    "noise on the velocity": ([0.0, 1.0], np.zeros((2, 2)), [[1.0, 1.0], [0.0, 1.0]], [[0.0, 1.0]], [[0.0], [1.0]]),
+    "content under a null pivot": ([0.0, 0.0], [[0.0, 0.0], [1.0, 0.0]], I2, [[0.0, 1.0]], np.zeros((2, 1))),
+    "projected": (
+        np.zeros(3), [[1.0, 0.0, 0.0], [0.3, 0.7, 0.0], [0.2, 0.1, 0.5]],
+        [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]], np.zeros((3, 1)),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SINGULAR)
+@pytest.mark.parametrize("step", [cubature.filter_step, cubature.diplf_step])
+def test_with_a_singular_factor_a_linear_step_is_that_of_the_kalman_filter(case, step):
+    mean, root, phi, h, noise = (np.asarray(a, float) for a in SINGULAR[case])
+    p = phi @ root @ root.T @ phi.T + noise @ noise.T
+    gain = p @ h.T / (h @ p @ h.T + 1.0)
+    known = phi @ mean + gain @ (2.0 - h @ phi @ mean)
+    for more in ({}, {"iterations": 3}) if step is cubature.diplf_step else ({},):
+        found, factor = step(mean, root, lambda x: phi @ x, lambda x: h @ x, [2.0], noise, [[1.0]], **more)
+        np.testing.assert_allclose(found, known, atol=1e-12)
+        np.testing.assert_allclose(factor @ factor.T, p - gain @ h @ p, atol=1e-12)
+    z, models = np.full((1, 1), 2.0), (lambda x: phi @ x, lambda x: h @ x)
+    method = "diplf" if step is cubature.diplf_step else "filter"
+    record = cubature.filter_interval(mean, root, *models, z, noise, [[1.0]], method=method)
+    np.testing.assert_allclose(record.mean[-1], known, atol=1e-12)
+
+
+def test_angles_are_numbers_of_components_and_no_mask():
+    with pytest.raises(ValueError, match="angles is a mask: the numbers of the components are needed"):
+        cubature.update(np.zeros(2), I2, same, [0.0, 0.0], I2, angles=[False, True])
+
+
 @pytest.mark.parametrize("step", [cubature.filter_step, cubature.backward_smoothing_step, cubature.diplf_step])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_one_state_many_measurements_and_the_given_precision(step, dtype):

@@ -205,3 +205,36 @@ def test_compiled_models_give_what_python_gives(rival):
     expected = rival.filter_step(mean, root, swing, sight, z, q, r)
     for found, known in zip(rival.filter_step(mean, root, njit(swing), njit(sight), z, q, r), expected, strict=True):
         np.testing.assert_allclose(found, known, rtol=1e-9)
+
+
+@pytest.mark.parametrize("rival", RIVALS)
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"sqrt_q": np.ones((400, 2))}, "sqrt_q has shape"),
+        ({"sqrt_r": np.ones((400, 2))}, "sqrt_r has shape"),
+        ({"sqrt_cov": np.ones((1, 1))}, "sqrt_cov has shape"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name(rival, changed, words):
+    given = {"sqrt_cov": ROOT, "sqrt_q": SQRT_Q, "sqrt_r": SQRT_R} | changed
+    with pytest.raises(ValueError, match=words):
+        rival.filter_step(MEAN, given["sqrt_cov"], f, h, Z, given["sqrt_q"], given["sqrt_r"])
+
+
+@pytest.mark.parametrize("rival", RIVALS)
+def test_a_model_may_write_on_the_state_it_is_given(rival):
+    def writes_f(x):
+        x[:] = PHI @ x
+        return x
+
+    def writes_h(x):
+        x *= 2.0
+        return 0.5 * H @ x
+
+    before = MEAN.copy()
+    clean = rival.filter_step(MEAN, ROOT, f, h, Z, SQRT_Q, SQRT_R)
+    written = rival.filter_step(MEAN, ROOT, writes_f, writes_h, Z, SQRT_Q, SQRT_R)
+    np.testing.assert_array_equal(MEAN, before)
+    for mine, theirs in zip(written, clean, strict=True):
+        np.testing.assert_allclose(mine, theirs, atol=1e-9)
