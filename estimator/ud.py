@@ -43,6 +43,11 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
     return cast(Callable[P, T], njit(cache=True, nogil=True, fastmath=flags, error_model="numpy")(function))
 
 
+def exact(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile as `compiled`, but with every operation rounded as IEEE 754 says: the same bits whatever it is part of."""
+    return cast(Callable[P, T], njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
 def follow(caller: str, *callees: str) -> None:
     """Forget the compiled kernels of the file ``caller`` where those here, or those of ``callees``, have changed since.
 

@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 from estimator import ud
 from estimator.cubature import reflections
 from estimator.cubature.reflections import NULL, reflect
-from estimator.cubature.reflections import strict as compiled
 from estimator.information import Filtered
 from estimator.model import LinearModel
+from estimator.ud import exact as compiled
 
 ud.follow(__file__, reflections.__file__)
 
