@@ -44,7 +44,7 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def exact(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile as `compiled`, but with every operation rounded as IEEE 754 says: the same bits whatever it is part of."""
+    """Compile as `compiled`, but with every operation rounded as IEEE 754 says: the same bits wherever it is used."""
     return cast(Callable[P, T], njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
