@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 # The tests go two at a time: what computes makes way for what runs against the clock, over processes and sockets.
-# What both use is compiled before: kernels compiled twice at the same time need not round alike.
+# What both use is compiled before, so that it is not compiled twice.
 COMPUTING := tests/estimator tests/sims
 
 .PHONY: help demo test test-computing test-running lint bench lock clean

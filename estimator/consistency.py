@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammainccinv, gammaincinv
 
-from estimator.ud import compiled
+from estimator.ud import compiled, exact
 
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -46,7 +46,7 @@ _UNIT = 1200  # the lowest limb counts in units of 2**-1200: below the last digi
 _LIMBS = (_UNIT + 1024) // _LIMB + 3
 
 
-@compiled
+@exact
 def _deposit(limbs: Counts, x: float) -> None:
     """Add a double to an integer of many limbs: exact, hence the same in every order."""
     fraction, exponent = math.frexp(abs(x))
@@ -60,7 +60,7 @@ def _deposit(limbs: Counts, x: float) -> None:
     limbs[limb + 2] += sign * (high >> _LIMB)
 
 
-@compiled
+@exact
 def _carry(limbs: Counts) -> None:
     """Bring every limb but the last into 0 .. 2**32 - 1: one number, one form; and no limb ever overflows."""
     for i in range(limbs.size - 1):

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from estimator import ud
 from estimator.model import LinearModel
-from estimator.ud import Array, Order, compiled, factor, solve, solve_transposed, solve_vector
+from estimator.ud import Array, Order, compiled, exact, factor, solve, solve_transposed, solve_vector
 from estimator.window import Rule
 
 ud.follow(__file__)
@@ -39,7 +39,7 @@ TABLES = 8  # of one model, by rule
 LONGEST_TABLE = 1000  # steps; a longer window of a constant model is worked out step by step
 
 
-@compiled
+@exact
 def condition(a: Array, lu: Array, order: Order, scale: Array, v: Array) -> float:
     """Estimate of the infinity-norm condition number of F = S^{-1} A S, S = diag(scale); ``v`` (4, n) is scratch.
 
@@ -91,7 +91,7 @@ def condition(a: Array, lu: Array, order: Order, scale: Array, v: Array) -> floa
     return largest
 
 
-@compiled
+@exact
 def suspect(a: Array, lu: Array, order: Order, scale: Array, limit: float) -> bool:
     """Do the pivots at hand say that the condition number of S^{-1} A S may be near ``limit``?"""
     n = a.shape[0]

@@ -42,7 +42,7 @@ import numpy as np
 
 from estimator import rotation, ud
 from estimator.rotation import euler, euler_jacobian, exponential, matrix, right_jacobian, turn, turn_earth
-from estimator.ud import Array, compiled
+from estimator.ud import Array, exact
 
 ud.follow(__file__, rotation.__file__)
 
@@ -113,7 +113,7 @@ class Earth(NamedTuple):
         return cls(gravity, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-@compiled
+@exact
 def cross_matrix(c1: float, c2: float, c3: float, m: Array) -> None:
     """Fill ``m`` (3, 3) with [c]x: m b = c x b."""
     m[0, 0], m[0, 1], m[0, 2] = 0.0, -c3, c2
@@ -121,7 +121,7 @@ def cross_matrix(c1: float, c2: float, c3: float, m: Array) -> None:
     m[2, 0], m[2, 1], m[2, 2] = -c2, c1, 0.0
 
 
-@compiled
+@exact
 def rates(r: Array, h: float, v: Array, f: Array, w: Array, earth: Earth, out: Array) -> None:
     """Fill ``out`` (4,) with h', v' at attitude ``r``; ``f``, ``w`` (3,) specific force and rate without bias."""
     g = earth.g0 + earth.gh * h
@@ -134,7 +134,7 @@ def rates(r: Array, h: float, v: Array, f: Array, w: Array, earth: Earth, out: A
     out[3] = f[2] + r[2, 2] * g - (a1 * v[1] - a2 * v[0])
 
 
-@compiled
+@exact
 def slopes(r: Array, h: float, v: Array, w: Array, earth: Earth, a: Array) -> None:
     """Fill ``a`` (4, 7) with d(h', v')/d(h, v, a); d v'/d ba = -I and d v'/d bg = -[v]x beside it."""
     g = earth.g0 + earth.gh * h
@@ -158,7 +158,7 @@ def slopes(r: Array, h: float, v: Array, w: Array, earth: Earth, a: Array) -> No
     a[3, 4], a[3, 5], a[3, 6] = e3 * v1 - g * d2, e3 * v2 + g * d1, e3 * v3 - dot
 
 
-@compiled
+@exact
 def step(
     x: Array, q: Array, u: Array, dt: float, earth: Earth, x1: Array, q1: Array, phi: Array, b: Array, work: Array
 ) -> None:
@@ -271,7 +271,7 @@ def step(
         b[3, j] += t1 * v2 - t2 * v1
 
 
-@compiled
+@exact
 def flow(v1: float, v2: float, v3: float, y: Array, g: Array) -> None:
     """Airspeed, alpha and beta ``y`` (3,) of a flow vector in body axes, and their gradients ``g`` (3, 3)."""
     plane = v1 * v1 + v3 * v3
@@ -284,7 +284,7 @@ def flow(v1: float, v2: float, v3: float, y: Array, g: Array) -> None:
     g[2, 0], g[2, 1], g[2, 2] = -v1 * v2 / (s * square), s / square, -v3 * v2 / (s * square)
 
 
-@compiled
+@exact
 def observe_air(x: Array, r: Array, w: Array, vane: Array, y: Array, h: Array, work: Array) -> None:
     """Airspeed, alpha and beta at the vanes: fills ``y`` (3,) and ``h`` (3, 23).
 
@@ -328,7 +328,7 @@ def observe_air(x: Array, r: Array, w: Array, vane: Array, y: Array, h: Array, w
             h[i, TURBULENCE + j] = -(r[j, 0] * g[i, 0] + r[j, 1] * g[i, 1] + r[j, 2] * g[i, 2])
 
 
-@compiled
+@exact
 def deafen(x: Array, r: Array, h: Array) -> None:
     """Take from the rows of alpha and beta, ``h`` (3, 23) as `observe_air` leaves them, what they tell of the airspeed.
 
@@ -348,7 +348,7 @@ def deafen(x: Array, r: Array, h: Array) -> None:
                 h[i, o + 1] -= along * n2
 
 
-@compiled
+@exact
 def observe_attitude(q: Array, y: Array, h: Array, work: Array) -> None:
     """Theta, phi, psi of the nominal attitude: fills ``y`` (3,) and ``h`` (3, 23)."""
     e = work[0:9].reshape(3, 3)
@@ -360,7 +360,7 @@ def observe_attitude(q: Array, y: Array, h: Array, work: Array) -> None:
             h[i, 4 + j] = e[i, j]
 
 
-@compiled
+@exact
 def observe_velocity(x: Array, r: Array, w: Array, antenna: Array, y: Array, h: Array) -> None:
     """North, east and down velocity of the antenna: fills ``y`` (3,) and ``h`` (3, 23)."""
     c1 = w[1] * antenna[2] - w[2] * antenna[1]

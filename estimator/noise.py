@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.ud import Array, compiled
+from estimator.ud import Array, compiled, exact
 
 
-@compiled
+@exact
 def factored(matrix: Array, tolerance: float, definite: bool, u: Array, d: Array) -> bool:
     """Factor ``matrix`` (k, k) = U diag(d) U^T; False when it is not symmetric, or not (semi)definite.
 

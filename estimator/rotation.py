@@ -11,14 +11,14 @@ from __future__ import annotations
 import numpy as np
 
 from estimator import ud
-from estimator.ud import Array, compiled
+from estimator.ud import Array, exact
 
 ud.follow(__file__)
 
 SMALL = 1e-4  # rad: below it series are exact to the last bit, and quotients are not
 
 
-@compiled
+@exact
 def matrix(q: Array, r: Array) -> None:
     """Fill ``r`` (3, 3) with R(q), body to north-east-down."""
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -33,7 +33,7 @@ def matrix(q: Array, r: Array) -> None:
     r[2, 2] = 1.0 - 2.0 * (x * x + y * y)
 
 
-@compiled
+@exact
 def turn(q: Array, a1: float, a2: float, a3: float, out: Array) -> None:
     """Fill ``out`` (4,) with q * exp(a): a rotation about body axes. ``out`` may be ``q``."""
     square = a1 * a1 + a2 * a2 + a3 * a3
@@ -52,7 +52,7 @@ def turn(q: Array, a1: float, a2: float, a3: float, out: Array) -> None:
     out[0], out[1], out[2], out[3] = w0 * norm, w1 * norm, w2 * norm, w3 * norm
 
 
-@compiled
+@exact
 def turn_earth(q: Array, a1: float, a2: float, a3: float, out: Array) -> None:
     """Fill ``out`` (4,) with exp(a) * q: a small rotation about north, east and down. ``out`` may be ``q``."""
     x, y, z = 0.5 * a1, 0.5 * a2, 0.5 * a3
@@ -65,7 +65,7 @@ def turn_earth(q: Array, a1: float, a2: float, a3: float, out: Array) -> None:
     out[0], out[1], out[2], out[3] = w0 * norm, w1 * norm, w2 * norm, w3 * norm
 
 
-@compiled
+@exact
 def difference(q: Array, p: Array, a: Array) -> None:
     """Fill ``a`` (3,) with the rotation vector from q to p: p = q * exp(a)."""
     w = q[0] * p[0] + q[1] * p[1] + q[2] * p[2] + q[3] * p[3]
@@ -79,7 +79,7 @@ def difference(q: Array, p: Array, a: Array) -> None:
     a[0], a[1], a[2] = scale * x, scale * y, scale * z
 
 
-@compiled
+@exact
 def exponential(a1: float, a2: float, a3: float, e: Array) -> None:
     """Fill ``e`` (3, 3) with exp([a]x), by Rodrigues' formula."""
     square = a1 * a1 + a2 * a2 + a3 * a3
@@ -100,7 +100,7 @@ def exponential(a1: float, a2: float, a3: float, e: Array) -> None:
     e[2, 2] = 1.0 - c * (a1 * a1 + a2 * a2)
 
 
-@compiled
+@exact
 def right_jacobian(a1: float, a2: float, a3: float, j: Array) -> None:
     """Fill ``j`` (3, 3): exp(a + da) = exp(a) exp(J da) to first order.
 
@@ -124,7 +124,7 @@ def right_jacobian(a1: float, a2: float, a3: float, j: Array) -> None:
     j[2, 2] = 1.0 - s * (a1 * a1 + a2 * a2)
 
 
-@compiled
+@exact
 def euler(q: Array, angles: Array) -> None:
     """Fill ``angles`` (3,) with theta in [-pi/2, pi/2], phi and psi in (-pi, pi]."""
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -134,7 +134,7 @@ def euler(q: Array, angles: Array) -> None:
     angles[2] = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
 
 
-@compiled
+@exact
 def euler_jacobian(theta: float, phi: float, e: Array) -> None:
     """Fill ``e`` (3, 3) with d(theta, phi, psi)/da, the inverse kinematic matrix; unbounded as |theta| -> pi/2."""
     sp, cp, ct = np.sin(phi), np.cos(phi), np.cos(theta)
@@ -146,7 +146,7 @@ def euler_jacobian(theta: float, phi: float, e: Array) -> None:
     e[2, 0], e[2, 1], e[2, 2] = 0.0, sp / ct, cp / ct
 
 
-@compiled
+@exact
 def quaternion(theta: float, phi: float, psi: float, q: Array) -> None:
     """Fill ``q`` (4,) from Euler angles 3-2-1."""
     ct, st = np.cos(0.5 * theta), np.sin(0.5 * theta)

@@ -26,8 +26,10 @@ from estimator.ud import (
     agee_turner_all,
     bierman,
     compiled,
+    exact,
     factor,
     mwgs,
+    part,
     solve,
     solve_transposed,
 )
@@ -49,7 +51,7 @@ def limits(dtype: np.dtype[Any]) -> tuple[float, float]:
     return PIVOT[dtype.itemsize], FAINT[dtype.itemsize]
 
 
-@compiled
+@exact
 def state(ut: Array, x: Array) -> None:
     """Solve U^T x = eta for the star states ``x`` (n, K); ``ut`` (n, K + n)."""
     n, records = x.shape
@@ -71,7 +73,7 @@ def state(ut: Array, x: Array) -> None:
                 own[t] -= u * known[t]
 
 
-@compiled
+@exact
 def rank(ut: Array, d: Array, pivot: float) -> int:
     """Count the pivots of the factor that are information and not rounding: above ``pivot``, measured by L_jj."""
     n = d.size
@@ -86,7 +88,7 @@ def rank(ut: Array, d: Array, pivot: float) -> int:
     return count
 
 
-@compiled
+@exact
 def inverse(ut: Array, w: Array) -> None:
     """Fill ``w`` (n, n) with U^{-T}: row j = e_j - sum_i U_ij row i."""
     n = ut.shape[0]
@@ -101,7 +103,7 @@ def inverse(ut: Array, w: Array) -> None:
                 own[k] -= u * known[k]
 
 
-@compiled
+@exact
 def determined(ut: Array, d: Array, w: Array, faint: float) -> bool:
     """Is the smallest singular value of diag(L)^{-1/2} U D^{1/2} surely above ``faint``? Full rank; ``w`` (n, n).
 
@@ -120,7 +122,7 @@ def determined(ut: Array, d: Array, w: Array, faint: float) -> bool:
     return norm * n * faint * faint < 1.0
 
 
-@compiled
+@exact
 def anchor(ut: Array, d: Array, phi: Array, regular: bool, eps: float) -> None:
     """Move the anchor to the present epoch: overwrite ``ut`` (n, K + n) and ``d``; ``phi`` (n, n) = phi_{j,0}.
 
@@ -161,7 +163,7 @@ def anchor(ut: Array, d: Array, phi: Array, regular: bool, eps: float) -> None:
                     ut[j, t] = eta
 
 
-@compiled
+@exact
 def spread(ut: Array, d: Array, phi: Array, w: Array, std: Array) -> None:
     """Fill ``std`` (n,) with the roots of the diagonal of phi L^{-1} phi^T; ``w`` (n, n) is scratch."""
     n = phi.shape[0]
@@ -285,7 +287,7 @@ def forward(
     return regular, -1
 
 
-@compiled
+@exact
 def terminal(ut: Array, d: Array, x: Array, vt: Array, dv: Array) -> None:
     """Start the way back: x* (n, K) from U^T x* = eta, and P* = L^{-1} as ``vt`` (n, n), ``dv`` (n,). All D > 0."""
     n = d.size
@@ -297,7 +299,7 @@ def terminal(ut: Array, d: Array, x: Array, vt: Array, dv: Array) -> None:
     mwgs(w, weight, vt, dv)
 
 
-@compiled
+@part
 def advance(x: Array, e: Array, b: Array, g: Array, row: int, i: int, c: int, miss: Array) -> None:
     """x* <- x* + e (g - b^T x*) for component ``c`` of step ``i``, whose e is in ``row``; ``miss`` (K,) is scratch."""
     n, records = x.shape
@@ -318,7 +320,7 @@ def advance(x: Array, e: Array, b: Array, g: Array, row: int, i: int, c: int, mi
             x[j, t] += e[row, c, j] * miss[t]
 
 
-@compiled
+@part
 def image(phi: Array, vt: Array, u: Array, w: Array) -> None:
     """Fill ``w`` (n, n) with phi U; ``u`` is scratch: a product of plain matrices is twice as fast as one with U^T."""
     n = phi.shape[0]
@@ -328,7 +330,7 @@ def image(phi: Array, vt: Array, u: Array, w: Array) -> None:
     np.dot(phi, u, w)
 
 
-@compiled
+@part
 def outer(w: Array, heavy: Array, out: Array) -> None:
     """Fill ``out`` (n, n) with w heavy^T, known to be symmetric: one triangle, mirrored, symmetric to the last bit."""
     n = w.shape[0]

@@ -22,7 +22,7 @@ import hashlib
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 from numba import njit  # type: ignore[import-untyped, unused-ignore]
@@ -34,18 +34,42 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+# All is said, for what is not said a function takes from the kernel for which it happens to be compiled.
+EXACT: Any = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": False, "forceinline": False}
+LEAN: Any = EXACT | {"_nrt": False}
+COMPILED: Any = EXACT | {"fastmath": {"reassoc", "contract", "nsz"}}
+
+
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile with numba and keep the declared type.
+    """Compile with numba and keep the declared type: what only Python calls; what kernels call is `part` or `exact`.
 
     NaN and infinity keep their meaning: they mark what is missing, and a division by zero is one of them, not an error.
+    Sums are reassociated and products fused with them.
     """
-    flags = {"reassoc", "contract", "nsz"}
-    return cast(Callable[P, T], njit(cache=True, nogil=True, fastmath=flags, error_model="numpy")(function))
+    return cast(Callable[P, T], njit(**COMPILED)(function))
+
+
+def part(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile as `compiled`, as a part of every kernel that calls it.
+
+    Two compilations of reassociated code need not round alike. A kernel has its own copy of what it calls; but in the
+    process that compiles both, the linker takes what was compiled first in its place, and the first flight on a machine
+    would differ from all later ones. What is inlined has no place.
+    """
+    return cast(Callable[P, T], njit(**(COMPILED | {"forceinline": True}))(function))
 
 
 def exact(function: Callable[P, T]) -> Callable[P, T]:
     """Compile as `compiled`, but with every operation rounded as IEEE 754 says: the same bits wherever it is used."""
-    return cast(Callable[P, T], njit(cache=True, nogil=True, error_model="numpy")(function))
+    return cast(Callable[P, T], njit(**EXACT)(function))
+
+
+def lean(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile as `exact`, for functions that allocate nothing: no references are counted.
+
+    With dozens of arrays in hand, that costs more than what is done with them.
+    """
+    return cast(Callable[P, T], njit(**LEAN)(function))
 
 
 def follow(caller: str, *callees: str) -> None:
@@ -66,7 +90,7 @@ def follow(caller: str, *callees: str) -> None:
             note.write_text(digest)
 
 
-@compiled
+@part
 def bierman(ut: Array, d: Array, h: Array, r: float, k: Array) -> float:
     """Downdate P = U D U^T by one scalar: P <- P - P h h^T P / s, s = r + h^T P h [1]_. Needs r > 0.
 
@@ -96,7 +120,7 @@ def bierman(ut: Array, d: Array, h: Array, r: float, k: Array) -> float:
     return a
 
 
-@compiled
+@part
 def agee_turner(ut: Array, d: Array, a: Array, c: float) -> float:
     """Update U D U^T <- U D U^T + c a a^T, c >= 0. Overwrites ``ut`` (n, K + n), ``d`` (n,) and ``a`` (K + n,).
 
@@ -132,7 +156,7 @@ def agee_turner(ut: Array, d: Array, a: Array, c: float) -> float:
     return c
 
 
-@compiled
+@part
 def agee_turner_all(ut: Array, d: Array, a: Array, c: Array, count: int) -> None:
     """The updates of ``agee_turner`` with the first ``count`` rows of ``a`` (k, K + n), weights ``c`` (k,), in order.
 
@@ -164,7 +188,7 @@ def agee_turner_all(ut: Array, d: Array, a: Array, c: Array, count: int) -> None
                     ut[j, i] = rho * ut[j, i] + beta * t
 
 
-@compiled
+@exact
 def mwgs(w: Array, weight: Array, ut: Array, d: Array) -> None:
     """Modified weighted Gram-Schmidt [1]_: W diag(weight) W^T = U D U^T for ``w`` (K + n, k), which is overwritten.
 
@@ -195,7 +219,7 @@ def mwgs(w: Array, weight: Array, ut: Array, d: Array) -> None:
                     other[k] -= dot * row[k]
 
 
-@compiled
+@exact
 def faint(a: Array, column: int, pivot: float, few: float) -> bool:
     """Is the square of ``pivot`` not above ``few`` times that of the largest entry of its column of ``a``?"""
     largest = 0.0
@@ -204,7 +228,7 @@ def faint(a: Array, column: int, pivot: float, few: float) -> bool:
     return not abs(pivot) > np.sqrt(few) * largest
 
 
-@compiled
+@exact
 def factor(a: Array, lu: Array, order: Order, eps: float = 2.3e-16) -> bool:
     """LU with partial pivoting: row ``order[i]`` of ``a`` (n, n) is row i of L U, both in ``lu``. True: a is singular.
 
@@ -266,7 +290,7 @@ def factor(a: Array, lu: Array, order: Order, eps: float = 2.3e-16) -> bool:
     return singular
 
 
-@compiled
+@exact
 def solve(lu: Array, order: Order, b: Array, x: Array) -> None:
     """Fill ``x`` (n, k) with A^{-1} b from the factors of A; all columns advance together, two rows at a time."""
     n, count = x.shape
@@ -297,7 +321,7 @@ def solve(lu: Array, order: Order, b: Array, x: Array) -> None:
             own[k] *= t
 
 
-@compiled
+@exact
 def solve_vector(lu: Array, order: Order, b: Array, x: Array) -> None:
     """Fill ``x`` (n,) with A^{-1} b from the factors of A."""
     n = x.size
@@ -313,7 +337,7 @@ def solve_vector(lu: Array, order: Order, b: Array, x: Array) -> None:
         x[i] = t / lu[i, i]
 
 
-@compiled
+@exact
 def solve_transposed(lu: Array, order: Order, b: Array, x: Array) -> None:
     """Overwrite ``b`` (n,) and fill ``x`` (n,) with A^{-T} b from the factors of A."""
     n = b.size

@@ -21,8 +21,8 @@ import numpy as np
 from numba.extending import register_jitable  # type: ignore[import-untyped, unused-ignore]
 
 from estimator.cubature import reflections
-from estimator.cubature.reflections import NULL, Array, annihilate, reduce, strict
-from estimator.ud import follow
+from estimator.cubature.reflections import NULL, Array, annihilate, reduce
+from estimator.ud import follow, lean
 
 follow(__file__, reflections.__file__)
 
@@ -108,7 +108,7 @@ def workspace(n: int, k: int, q: int, m: int, r: int, like: Array) -> Work:
     )
 
 
-@strict
+@lean
 def draw(mean: Array, root: Array, points: Array) -> None:
     """Draw the ``points`` (2 n + 1, n): mean +- sqrt(n) times the columns of ``root``, and the mean."""
     n = mean.size
@@ -122,7 +122,7 @@ def draw(mean: Array, root: Array, points: Array) -> None:
         points[2 * n, k] = mean[k]
 
 
-@strict
+@lean
 def moments(values: Array, n: int, k: int, mean: Array, parts: Array) -> None:
     """Mean, odd and even parts of the first ``k`` components of 2 ``n`` images."""
     scale = values.dtype.type(0.5 / np.sqrt(n))
@@ -142,7 +142,7 @@ def moments(values: Array, n: int, k: int, mean: Array, parts: Array) -> None:
             parts[i, c] = scale * (parts[i, c] - (mean[c] + mean[c]))
 
 
-@strict
+@lean
 def noise_factor(root: Array, rows: Any, k: int, n: int, noise: Array, top: Array, floor: Array) -> None:
     """Tria(S_noise) of the ``k`` rows ``rows`` of ``root`` into ``top``, zeros right of it; diagonal: ``floor``."""
     q = root.shape[1]
@@ -158,7 +158,7 @@ def noise_factor(root: Array, rows: Any, k: int, n: int, noise: Array, top: Arra
             top[i, j] = 0.0
 
 
-@strict
+@lean
 def couple(root: Array, k: int, n: int, evens: int, parts: Array, top: Array, below: Array, floor: Array) -> None:
     """Even parts into the noise factor, T = Tria([even, S_noise]), and [odd, S^T] into ``below``."""
     annihilate(top, parts[n : n + evens], evens, k, k, floor, 0.0)
@@ -169,7 +169,7 @@ def couple(root: Array, k: int, n: int, evens: int, parts: Array, top: Array, be
             below[i, k + j] = root[j, i] if j >= i else 0.0
 
 
-@strict
+@lean
 def take(predicted: Array, top: Array, mean: Array, root: Array) -> None:
     """The mean of the images under f, and L11."""
     k = mean.size
@@ -179,7 +179,7 @@ def take(predicted: Array, top: Array, mean: Array, root: Array) -> None:
             root[i, j] = top[j, i] if j <= i else 0.0
 
 
-@strict
+@lean
 def copy(source: Array, target: Array, source_root: Array, target_root: Array) -> None:
     """A state into another."""
     for i in range(source.size):
@@ -188,7 +188,7 @@ def copy(source: Array, target: Array, source_root: Array, target_root: Array) -
             target_root[i, j] = source_root[i, j]
 
 
-@strict
+@lean
 def measured(z: Array, turns: Any, present: Any, told: Array) -> int:
     """List in ``present`` which components of z are there: how many, negative where one of them is an angle."""
     count, angle = 0, False
@@ -201,7 +201,7 @@ def measured(z: Array, turns: Any, present: Any, told: Array) -> int:
     return -count if angle else count
 
 
-@strict
+@lean
 def choose(n: int, m: int, turns: Any, present: Any, values: Array) -> None:
     """The ``m`` components that are there of the images under h come first; angles are unwrapped about h(mean)."""
     for j in range(m):
@@ -215,7 +215,7 @@ def choose(n: int, m: int, turns: Any, present: Any, values: Array) -> None:
                 values[i, j] = values[i, c]
 
 
-@strict
+@lean
 def compare(z: Array, m: int, turns: Any, present: Any, expected: Array, innovation: Array) -> None:
     """The innovations of the ``m`` components that are there; those of angles are in (-pi, pi]."""
     for j in range(m):
@@ -225,7 +225,7 @@ def compare(z: Array, m: int, turns: Any, present: Any, expected: Array, innovat
             innovation[j] = wrapped(innovation[j])
 
 
-@strict
+@lean
 def gain_by(
     m: int,
     dropped: int,
@@ -262,7 +262,7 @@ def gain_by(
             out[i, j] = below[j, m + i] if j <= i else 0.0
 
 
-@strict
+@lean
 def retrace(
     dropped: int,
     prior: Array,
@@ -309,14 +309,14 @@ def retrace(
             out[i, j] = stack[j, i] if j <= i else 0.0
 
 
-@strict
+@lean
 def wrapped(angle: Any) -> Any:
     """``angle`` in (-pi, pi], in its own precision."""
     turn = 2.0 * np.pi
     return angle - turn * np.ceil((angle - np.pi) / turn)
 
 
-@strict
+@lean
 def regress(root: Array, n: int, k: int, slope: Array, parts: Array) -> None:
     """Slope A of y about N(., S S^T): A S = odd, column by column; zero where a pivot of S is rounding.
 
@@ -337,7 +337,7 @@ def regress(root: Array, n: int, k: int, slope: Array, parts: Array) -> None:
             parts[j, c] = value if null else 0.0
 
 
-@strict
+@lean
 def reproject(root: Array, n: int, k: int, slope: Array, parts: Array) -> int:
     """A S of the ``root`` (n, n) S in the place of the odd parts; the errors of the regression join the even ones.
 
@@ -359,7 +359,7 @@ def reproject(root: Array, n: int, k: int, slope: Array, parts: Array) -> int:
     return rows
 
 
-@strict
+@lean
 def extrapolate(at: Array, about: Array, k: int, mean: Array, slope: Array, out: Array) -> None:
     """A regression about ``about``, at ``at``: mean + A (at - about)."""
     n = at.size

@@ -13,10 +13,10 @@ from numba import from_dtype, njit, typeof, types  # type: ignore[import-untyped
 from numba.core.dispatcher import Dispatcher  # type: ignore[import-untyped, unused-ignore]
 from numba.extending import register_jitable  # type: ignore[import-untyped, unused-ignore]
 
+from estimator.ud import LEAN
+
 P = ParamSpec("P")
 T = TypeVar("T")
-
-LEAN: Any = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}  # nothing allocates, none is counted
 
 
 def woven(function: Callable[P, T]) -> Callable[P, T]:

@@ -10,15 +10,14 @@ from estimator import ud
 from estimator.cubature import flight_points, reflections
 from estimator.cubature.flight_points import deviations, straighten
 from estimator.cubature.flight_structures import Desk, K, Layout, Rows
-from estimator.cubature.flight_structures import lean as compiled
 from estimator.cubature.reflections import reflect
 from estimator.extended.structures import Flags
-from estimator.ud import Array
+from estimator.ud import Array, lean
 
 ud.follow(__file__, reflections.__file__, flight_points.__file__)
 
 
-@compiled
+@lean
 def go_back(filtered: Array, predicted: Array, changed: int, gain: Array, left: Array, x: Array, root: Array,
             factors: bool, stack: Array) -> None:  # fmt: skip
     """One step back: ``x`` (n,) and ``root`` (n, n) after it, smoothed, become those before it.
@@ -76,7 +75,7 @@ def go_back(filtered: Array, predicted: Array, changed: int, gain: Array, left: 
             root[first + i, first + c] = stack[first + i, c] if c >= i else 0.0
 
 
-@compiled
+@lean
 def backward(
     layout: Layout, rows: Rows, x: Array, root: Array, begin: Array, q0: Array, shown: Flags, factors: bool,
     means: Array, attitudes: Array, std: Array, desk: Desk, stack: Array,

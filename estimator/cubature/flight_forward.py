@@ -17,11 +17,10 @@ from estimator.cubature.flight_points import deviations, wrapped
 from estimator.cubature.flight_seen import see
 from estimator.cubature.flight_step import predict
 from estimator.cubature.flight_structures import SPARE, Carry, Desk, Layout, Rows
-from estimator.cubature.flight_structures import lean as compiled
 from estimator.extended.forward import ACCEPT, GROUP, MEMORY, QUIET, ROW, SHARE, WEAKEN
 from estimator.extended.structures import ABSENT, REJECTED, USED, WEAKENED, Drive, Told
 from estimator.kinematics import ATTITUDE, HEIGHT, TURBULENCE, M
-from estimator.ud import Array
+from estimator.ud import Array, lean
 
 ud.follow(
     __file__, str(Path(extended.__file__).parent / "forward.py"), *flight_step.FOLLOWED, flight_step.__file__,
@@ -29,7 +28,7 @@ ud.follow(
 )  # fmt: skip
 
 
-@compiled
+@lean
 def condition(c: int, variance: float, root: Array, seen: Array, spare: Array, pivot: Array) -> float:
     """Rotate scalar ``c`` of the joint array into its triangular form; returns the deviation of its innovation.
 
@@ -70,7 +69,7 @@ def condition(c: int, variance: float, root: Array, seen: Array, spare: Array, p
     return head
 
 
-@compiled
+@lean
 def spread(c: int, seen: Array, spare: Array) -> float:
     """Variance of what scalar ``c`` is expected to be, given the scalars before, without its own noise."""
     t = 0.0
@@ -81,7 +80,7 @@ def spread(c: int, seen: Array, spare: Array) -> float:
     return t
 
 
-@compiled
+@lean
 def forward(layout: Layout, drive: Drive, gated: bool, carry: Carry, desk: Desk, rows: Rows, told: Told) -> int:
     """Filter N steps; returns the first step whose result is not finite, or -1.
 
@@ -181,7 +180,7 @@ def forward(layout: Layout, drive: Drive, gated: bool, carry: Carry, desk: Desk,
     return -1
 
 
-@compiled
+@lean
 def doubt(layout: Layout, carry: Carry, group: int, root: Array, std: Array) -> None:
     """Note that the filter is to be doubted about a group of states: ten times its variance, from the next step on."""
     for i in range(3):

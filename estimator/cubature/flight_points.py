@@ -27,11 +27,10 @@ import numpy as np
 from estimator import kinematics, rotation, ud
 from estimator.cubature import reflections
 from estimator.cubature.flight_structures import TURN, B, K
-from estimator.cubature.flight_structures import lean as compiled
 from estimator.cubature.reflections import NULL, reflect
 from estimator.kinematics import Earth, rates
 from estimator.rotation import difference, euler, exponential, matrix, turn, turn_earth
-from estimator.ud import Array, Order
+from estimator.ud import Array, Order, lean
 
 ud.follow(__file__, kinematics.__file__, rotation.__file__, reflections.__file__)
 
@@ -40,7 +39,7 @@ FAR = np.sqrt(3.0)  # standard deviations from the mean to a point
 BEND = np.sqrt(2.0) / 6.0
 
 
-@compiled
+@lean
 def image(
     core: Array, h: float, over: Array, q: Array, u: Array, dt: float, earth: Earth, q1: Array, r1: Array, y: Array,
     work: Array,
@@ -89,14 +88,14 @@ def image(
         y[4 + i] = a[i]
 
 
-@compiled
+@lean
 def compress(z: Array, count: int, k: int) -> None:
     """Make ``z[:count, :k]`` upper triangular: rows are deviations, and what is left is the transposed factor."""
     for j in range(k):
         reflect(z, j, z, j + 1, count, j, k)
 
 
-@compiled
+@lean
 def part(plus: Array, minus: Array, centre: Array, i: int, first: int, stop: int, odd: Array, even: Array) -> None:
     """Take the images of the ``i``-th pair of points into ``odd`` and ``even`` (k, >= stop).
 
@@ -108,7 +107,7 @@ def part(plus: Array, minus: Array, centre: Array, i: int, first: int, stop: int
         even[i, c] = plus[c] + minus[c] - 2.0 * centre[c]
 
 
-@compiled
+@lean
 def settle(k: int, first: int, stop: int, centre: Array, mean: Array, even: Array) -> None:
     """Fill ``mean`` and bring ``even`` (k, >= stop) to its final form, once all pairs have been taken."""
     for c in range(first, stop):
@@ -119,7 +118,7 @@ def settle(k: int, first: int, stop: int, centre: Array, mean: Array, even: Arra
         mean[c] = centre[c] + t / 6.0
 
 
-@compiled
+@lean
 def regress(z: Array, k: int, odd: Array, first: int, stop: int, slope: Array) -> None:
     """Fill ``slope`` (k, >= stop): row i is how the images change with the i-th state. A L = odd, ``z`` = L^T.
 
@@ -142,7 +141,7 @@ def regress(z: Array, k: int, odd: Array, first: int, stop: int, slope: Array) -
             slope[j, c] = t / pivot
 
 
-@compiled
+@lean
 def core(root: Array, bias: int, z: Array) -> None:
     """Fill the first three rows of ``z`` (>= n, >= 9): how rotation and biases go with what the rotation is made of.
 
@@ -160,14 +159,14 @@ def core(root: Array, bias: int, z: Array) -> None:
         reflect(z, j, z, TURN, n, j, TURN + B)
 
 
-@compiled
+@lean
 def wrapped(angle: float) -> float:
     """The angle in [-pi, pi]."""
     turned: float = angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
     return turned
 
 
-@compiled
+@lean
 def told(q: Array, v: Array, a1: float, a2: float, a3: float, y: Array, work: Array) -> None:
     """Fill ``y`` (6,) with (u, v, w) and Euler angles at velocity ``v`` (3,) along nominal axes and a rotation."""
     now, e = work[0:4], work[4:13].reshape(3, 3)
@@ -178,7 +177,7 @@ def told(q: Array, v: Array, a1: float, a2: float, a3: float, y: Array, work: Ar
     euler(now, y[3:6])
 
 
-@compiled
+@lean
 def deviations(
     named: Order, root: Array, x: Array, q: Array, std: Array, z: Array, plus: Array, minus: Array, centre: Array,
     work: Array,
@@ -227,7 +226,7 @@ def deviations(
         std[1 + c] = np.sqrt(std[1 + c] + shift[c] * shift[c])
 
 
-@compiled
+@lean
 def straighten(order: Order, x: Array, q: Array, start: Array, out: Array, attitude: Array, work: Array) -> None:
     """Fill ``out`` (k, 23) by number and ``attitude`` (k, 4) with states ``x`` (k, n) about ``q``, rotation zero."""
     e = work[0:9].reshape(3, 3)

@@ -15,7 +15,6 @@ from estimator import kinematics, rotation, ud
 from estimator.cubature import flight_points, reflections
 from estimator.cubature.flight_points import FAR, compress, part, regress, settle, wrapped
 from estimator.cubature.flight_structures import Desk, Layout
-from estimator.cubature.flight_structures import lean as compiled
 from estimator.cubature.reflections import reflect
 from estimator.kinematics import (
     ATTITUDE,
@@ -32,12 +31,12 @@ from estimator.kinematics import (
     deafen,
 )  # fmt: skip
 from estimator.rotation import euler, exponential, matrix, turn
-from estimator.ud import Array
+from estimator.ud import Array, lean
 
 ud.follow(__file__, kinematics.__file__, rotation.__file__, reflections.__file__, flight_points.__file__)
 
 
-@compiled
+@lean
 def lever(x: Array, omega: Array, arm: Array, out: Array, by: Array, work: Array) -> None:
     """What an arm adds to a velocity: ``out`` (3,) along body axes; ``by`` (3, 3), by bg, along nominal axes."""
     e, c = work[0:9].reshape(3, 3), work[9:18].reshape(3, 3)
@@ -51,7 +50,7 @@ def lever(x: Array, omega: Array, arm: Array, out: Array, by: Array, work: Array
             by[i, j] = e[i, 0] * c[0, j] + e[i, 1] * c[1, j] + e[i, 2] * c[2, j]
 
 
-@compiled
+@lean
 def vanes(p: Array, k: Array, ahead: Array, offsets: Array, slopes: bool, y: Array, work: Array) -> None:
     """Fill ``y`` (3,): airspeed, alpha, beta of flow p[0:3] less gusts p[3:6], along nominal axes, rotation p[6:9].
 
@@ -74,7 +73,7 @@ def vanes(p: Array, k: Array, ahead: Array, offsets: Array, slopes: bool, y: Arr
         y[2] += k[2] * np.arctan2(c2, np.sqrt(calm))
 
 
-@compiled
+@lean
 def see_air(layout: Layout, x: Array, r: Array, omega: Array, root: Array, desk: Desk) -> bool:
     """Regress airspeed, alpha and beta: y, h and the first three rows of spare; False where it is too slow for them.
 
@@ -160,7 +159,7 @@ def see_air(layout: Layout, x: Array, r: Array, omega: Array, root: Array, desk:
     return True
 
 
-@compiled
+@lean
 def see_turned(layout: Layout, x: Array, q: Array, r: Array, omega: Array, root: Array, desk: Desk) -> bool:
     """Regress Euler angles and velocity over ground: y, h and the last three rows of spare.
 
@@ -217,7 +216,7 @@ def see_turned(layout: Layout, x: Array, q: Array, r: Array, omega: Array, root:
     return bool(abs(about[ATTITUDE]) <= STEEP)
 
 
-@compiled
+@lean
 def see(layout: Layout, z: Array, x: Array, q: Array, rate: Array, root: Array, desk: Desk) -> tuple[bool, bool]:
     """Regress what is measured, ``z`` (10,): y, h, seen and spare of ``desk``.
 

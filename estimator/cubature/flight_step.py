@@ -18,17 +18,16 @@ from estimator import kinematics, rotation, ud
 from estimator.cubature import flight_points, reflections
 from estimator.cubature.flight_points import EPS, FAR, core, image, part, regress, settle
 from estimator.cubature.flight_structures import TURN, B, Carry, Desk, K, Layout
-from estimator.cubature.flight_structures import lean as compiled
 from estimator.cubature.reflections import NULL, reflect
 from estimator.kinematics import TURBULENCE, step
 from estimator.rotation import matrix
-from estimator.ud import Array
+from estimator.ud import Array, lean
 
 FOLLOWED = (kinematics.__file__, rotation.__file__, reflections.__file__, flight_points.__file__)
 ud.follow(__file__, *FOLLOWED)
 
 
-@compiled
+@lean
 def regress_step(layout: Layout, x: Array, q: Array, root: Array, u: Array, dt: float, desk: Desk) -> None:
     """Regress a step: predicted mean, q1, odd parts in ``moved``, even parts in the first rows of ``noise``."""
     bias = layout.at[7]
@@ -72,7 +71,7 @@ def regress_step(layout: Layout, x: Array, q: Array, root: Array, u: Array, dt: 
             desk.moved[B + 4 + j, c] = slope[j, c]
 
 
-@compiled
+@lean
 def carry_over(root: Array, bias: int, moved: Array, out: Array) -> None:
     """Fill ``out`` (n, 8) with the images of the columns of S in the kinematic states."""
     n = root.shape[0]
@@ -99,7 +98,7 @@ def carry_over(root: Array, bias: int, moved: Array, out: Array) -> None:
             own[c + 3] = t3
 
 
-@compiled
+@lean
 def lead_back(root: Array, changed: int, gain: Array) -> None:
     """Turn ``gain`` (n, >= changed) from L21^T into W^T = L11^{-T} L21^T, with L11^T = ``root``.
 
@@ -135,7 +134,7 @@ def lead_back(root: Array, changed: int, gain: Array) -> None:
             own[c] *= inverse
 
 
-@compiled
+@lean
 def predict(
     layout: Layout, carry: Carry, u: Array, dt: float, fade: float, variances: Array, desk: Desk, gain: Array,
     left: Array,

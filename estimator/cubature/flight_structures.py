@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit  # type: ignore[import-untyped, unused-ignore]
 
 from estimator.extended import Model
 from estimator.kinematics import STATES, TURBULENCE, Earth, M
@@ -16,19 +14,6 @@ K, B = 7, 6  # kinematic states, and the biases that drive them
 TURN = 3  # the rotation: what a step is not linear in, given that
 FLOW = 12  # at most: flow without gusts, gusts, rotation, scale error and slopes, in which the vanes are not linear
 SPARE = 6  # rows of what the regression of a measurement leaves: three of the air data, three of the rotation
-
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def lean(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile as `ud.compiled`, for functions that allocate nothing: no references are counted.
-
-    With dozens of arrays in hand, that costs more than what is done with them.
-    """
-    flags = {"reassoc", "contract", "nsz"}
-    options: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": flags, "error_model": "numpy", "_nrt": False}
-    return cast(Callable[P, T], njit(**options)(function))
 
 
 class Layout(NamedTuple):

@@ -13,8 +13,8 @@ from estimator.cubature import arrays, kernels, models, reflections
 from estimator.cubature.arguments import Function
 from estimator.cubature.arrays import Work, copy
 from estimator.cubature.compile import Kernel
-from estimator.cubature.reflections import Array, strict
-from estimator.ud import follow
+from estimator.cubature.reflections import Array
+from estimator.ud import follow, lean
 
 follow(__file__, arrays.__file__, kernels.__file__, models.__file__, reflections.__file__)
 
@@ -43,7 +43,7 @@ class Smoothed(NamedTuple):
     filtered: Filtered
 
 
-@strict
+@lean
 def note(
     j: int, present: Any, found: Array, deviation: Array, of: Array, innovation: Array, spread: Array, told: Array
 ) -> None:

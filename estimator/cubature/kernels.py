@@ -15,7 +15,7 @@ and ``u`` None or what is handed on to f(x, u) and h(x, u). Arrays are C-contigu
 component of z is NaN.
 
 A loop that allocates counts the references to every array in ``work`` at every use. A function around the step that is
-compiled as in ``reflections.strict`` counts none, which makes a step a third faster.
+compiled as in ``ud.lean`` counts none, which makes a step a third faster.
 """
 
 from __future__ import annotations

@@ -6,9 +6,6 @@ with the largest entry is taken as the pivot and the reflection has the sign tha
 many orders of magnitude (a wide prior, an accurate measurement) each keep their own digits [1]_. The sign of a finished
 row makes its diagonal entry non-negative.
 
-The arithmetic is strict IEEE, no reassociation and no fused operations: a step gives the same bits whatever it is
-compiled into.
-
 References
 ----------
 .. [1] A. J. Cox and N. J. Higham, "Stability of Householder QR factorization for weighted least squares problems",
@@ -17,16 +14,16 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any
 
 import numpy as np
-from numba import njit  # type: ignore[import-untyped, unused-ignore]
 from numpy.typing import NDArray
 
+from estimator.ud import exact, follow, lean
+
+follow(__file__)
+
 Array = NDArray[Any]  # float64 or float32: what goes in says which
-P = ParamSpec("P")
-T = TypeVar("T")
 
 NULL = 50.0  # a pivot of k columns is rounding where it is below NULL k eps of its row of the factor,
 REAL = 8.0  # unless the noise alone makes it larger than REAL eps of that row
@@ -36,17 +33,7 @@ SMALL, LARGE = 1e-15, 1e15  # of a norm: their squares are normal numbers in eit
 ONE, TWO, THREE, FOUR = np.uintp(1), np.uintp(2), np.uintp(3), np.uintp(4)
 
 
-def strict(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile with numba, IEEE arithmetic kept to the letter, and keep the declared type.
-
-    Nothing in such a function allocates, and no references are counted: with dozens of arrays that costs more than what
-    is done with them.
-    """
-    options: Any = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
-    return cast(Callable[P, T], njit(**options)(function))
-
-
-@strict
+@lean
 def reflect(top: Array, row: int, others: Array, first: int, stop: int, at: int, columns: int) -> None:
     """One reflection: ``others[first:stop, at]`` becomes zero, ``top[row, at]`` the norm of what was there.
 
@@ -126,7 +113,7 @@ def reflect(top: Array, row: int, others: Array, first: int, stop: int, at: int,
         others[i, column] = 0.0
 
 
-@strict
+@lean
 def reduce(a: Array, rows: int, first: int, width: int) -> None:
     """Make ``a[:rows, first:width]`` upper triangular, in place. Rows below the triangle become zero.
 
@@ -139,7 +126,7 @@ def reduce(a: Array, rows: int, first: int, width: int) -> None:
         reflect(a, j, a, j + 1, rows, first + j, width)
 
 
-@strict
+@lean
 def echelon(root: Array, rows: Array) -> None:
     """Bring a singular factor to the form in which a pivot that is rounding has an empty column; else leave it.
 
@@ -183,7 +170,7 @@ def echelon(root: Array, rows: Array) -> None:
             root[j, first] = rows[i, j]
 
 
-@strict
+@lean
 def annihilate(top: Array, below: Array, rows: int, count: int, width: int, floor: Array, drop: float) -> int:
     """Reflect ``below[:rows]`` into the triangle ``top`` (count, width): its first ``count`` columns become zero.
 
@@ -226,7 +213,7 @@ def annihilate(top: Array, below: Array, rows: int, count: int, width: int, floo
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@exact
 def _tria(a: Array, out: Array) -> None:
     n, columns = a.shape
     rows = max(n, columns)

@@ -26,7 +26,7 @@ from estimator.cubature import reflections
 from estimator.cubature.reflections import NULL, reflect
 from estimator.information import Filtered
 from estimator.model import LinearModel
-from estimator.ud import exact as compiled
+from estimator.ud import exact
 
 ud.follow(__file__, reflections.__file__)
 
@@ -233,14 +233,14 @@ def smooth(store: Store, carry: Carry) -> tuple[Floats, Floats]:
     return mean, std
 
 
-@compiled
+@exact
 def _triangle(a: Floats, rows: int, count: int, first: int, width: int) -> None:
     """Make ``count`` columns of ``a[:rows]`` from ``first`` on upper triangular; what is right of them goes with it."""
     for c in range(count):
         reflect(a, c, a, c + 1, rows, first + c, width)
 
 
-@compiled
+@exact
 def _lower(upper: Floats, column: int, root: Floats) -> None:
     """``root`` is the transpose of the triangle that begins at ``upper[0, column]``."""
     n = root.shape[0]
@@ -249,7 +249,7 @@ def _lower(upper: Floats, column: int, root: Floats) -> None:
             root[k, i] = upper[i, column + k] if k >= i else 0.0
 
 
-@compiled
+@exact
 def _spread(root: Floats, std: Floats) -> bool:
     """Standard deviations of a factor; whether all are finite."""
     fine = True
@@ -262,7 +262,7 @@ def _spread(root: Floats, std: Floats) -> bool:
     return fine
 
 
-@compiled
+@exact
 def _carried(phi: Floats, noise: Floats, root: Floats, rows: Floats) -> None:
     """Rows 0..n + p of ``rows`` begin with the columns of phi S and of S_Q."""
     n, p = noise.shape
@@ -277,7 +277,7 @@ def _carried(phi: Floats, noise: Floats, root: Floats, rows: Floats) -> None:
             rows[n + j, c] = noise[c, j]
 
 
-@compiled
+@exact
 def _forward(
     phi: Floats, noise: Floats, h: Floats, deviation: Floats, z: Floats, mean: Floats, root: Floats, means: Floats,
     roots: Floats, shown: Floats, std: Floats, nis: Floats, dof: NDArray[np.int64],
@@ -343,7 +343,7 @@ def _forward(
     return -1
 
 
-@compiled
+@exact
 def _backward(
     means: Floats, roots: Floats, phi: Floats, noise: Floats, root: Floats, smoothed: Floats, std: Floats
 ) -> None:

@@ -10,12 +10,12 @@ from estimator.extended.blocks import EPS, place, seen, unplace
 from estimator.extended.structures import B, Carry, Flags, K, Model, Rows
 from estimator.rotation import exponential, turn
 from estimator.sweeps import state, terminal
-from estimator.ud import Array, compiled, factor, solve
+from estimator.ud import Array, compiled, factor, part, solve
 
 ud.follow(__file__, rotation.__file__, sweeps.__file__, blocks.__file__)
 
 
-@compiled
+@part
 def dense(vt: Array, d: Array, p: Array) -> None:
     """Fill ``p`` (n, n) with U diag(d) U^T, symmetric to the last bit."""
     n = d.size
@@ -28,7 +28,7 @@ def dense(vt: Array, d: Array, p: Array) -> None:
             p[j, i] = t
 
 
-@compiled
+@part
 def variances(
     model: Model,
     q: Array,
@@ -69,7 +69,7 @@ def variances(
         std[i] = np.sqrt(variance)
 
 
-@compiled
+@part
 def undo(p: Array, e: Array, first: int, stop: int, b: Array, qs: float, k: Array) -> None:
     """P* <- (I - e b^T) P* (I - e b^T)^T + qs e e^T for ``e`` (n,) that is zero outside first..stop-1.
 
@@ -101,7 +101,7 @@ def undo(p: Array, e: Array, first: int, stop: int, b: Array, qs: float, k: Arra
             p[j, i] = row[j]
 
 
-@compiled
+@part
 def refactor(p: Array, vt: Array, d: Array) -> None:
     """Factor ``p`` (n, n), which is overwritten: P = U diag(d) U^T."""
     n = d.size

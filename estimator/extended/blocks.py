@@ -13,14 +13,14 @@ from estimator.extended.structures import B, Carry, K, Model
 from estimator.kinematics import TURBULENCE
 from estimator.rotation import euler, euler_jacobian, exponential, turn
 from estimator.sweeps import spread
-from estimator.ud import Array, Order, compiled, factor, mwgs, solve
+from estimator.ud import Array, Order, exact, factor, mwgs, part, solve
 
 ud.follow(__file__, rotation.__file__, sweeps.__file__)
 
 EPS = 2.3e-16
 
 
-@compiled
+@exact
 def follow_on(phi: Array, b6: Array, a: Array, b: Array, a_new: Array, b_new: Array) -> None:
     """Fill ``a_new`` with phi a and ``b_new`` with phi b + b6: no rotation depends on height or velocity, nor on ba."""
     for i in range(4):
@@ -50,7 +50,7 @@ def follow_on(phi: Array, b6: Array, a: Array, b: Array, a_new: Array, b_new: Ar
             b_new[i, j] = b6[i, j] + phi[i, 4] * b[4, j] + phi[i, 5] * b[5, j] + phi[i, 6] * b[6, j]
 
 
-@compiled
+@exact
 def divide(a: Array, right: Array, out: Array, work: Array) -> None:
     """Fill ``out`` (7, 6) with a^{-1} right, by the blocks a = [[f, g], [0, w]] of 4 and 3 rows.
 
@@ -106,7 +106,7 @@ def divide(a: Array, right: Array, out: Array, work: Array) -> None:
         out[4, j], out[5, j], out[6, j] = t4, t5, t6
 
 
-@compiled
+@part
 def downdate(ut: Array, d: Array, h: Array, first: int, stop: int, r: float, k: Array) -> float:
     """``ud.bierman`` with one column of data, for ``h`` (n,) that is zero outside first..stop-1."""
     n = d.size
@@ -134,7 +134,7 @@ def downdate(ut: Array, d: Array, h: Array, first: int, stop: int, r: float, k: 
     return a
 
 
-@compiled
+@part
 def innovate(ut: Array, d: Array, m: Array, z: float, r: float, f: Array) -> tuple[float, float]:
     """Innovation of z = m^T x* + v and its variance, before it is absorbed: U f = m, S = r + sum f_i^2 / D_i."""
     n = d.size
@@ -151,7 +151,7 @@ def innovate(ut: Array, d: Array, m: Array, z: float, r: float, f: Array) -> tup
     return z, s
 
 
-@compiled
+@exact
 def place(s: Array, star: Array, a: Array, b: Array, fade: float, fades: Array, x: Array) -> None:
     """Fill ``x`` (n,) with s + phi x*."""
     n = s.size
@@ -169,7 +169,7 @@ def place(s: Array, star: Array, a: Array, b: Array, fade: float, fades: Array, 
         x[base + i] = t
 
 
-@compiled
+@exact
 def unplace(
     x: Array, s: Array, lu: Array, order: Order, b: Array, fade: float, fades: Array, star: Array, v: Array
 ) -> None:
@@ -191,7 +191,7 @@ def unplace(
         star[base + i] = left[i, 0]
 
 
-@compiled
+@part
 def project(h: Array, model: Model, a: Array, b: Array, fade: float, m: Array) -> None:
     """Fill ``m`` (n,) with h phi, ``h`` (23,) by the numbers of the states."""
     n = m.size
@@ -210,7 +210,7 @@ def project(h: Array, model: Model, a: Array, b: Array, fade: float, m: Array) -
         m[base + j] = t
 
 
-@compiled
+@exact
 def seen(q: Array, x: Array, a: Array, b: Array, rows: Array, w: Array) -> None:
     """Fill ``rows`` (7, 13): h, (u, v, w) and Euler angles at the estimate ``x`` (n,) about ``q``, by the biases and
     the kinematic states at the anchor. ``w`` (200,) is scratch.
@@ -243,7 +243,7 @@ def seen(q: Array, x: Array, a: Array, b: Array, rows: Array, w: Array) -> None:
         six[j] = e[2, 0] * t1 + e[2, 1] * t2 + e[2, 2] * t3
 
 
-@compiled
+@exact
 def deviations(
     model: Model,
     ut: Array,
@@ -300,7 +300,7 @@ def deviations(
         std[i] = np.sqrt(t)
 
 
-@compiled
+@exact
 def image(model: Model, a: Array, b: Array, fade: float, phi: Array) -> None:
     """Fill ``phi`` (n, n): phi_{j,0}, its rows in the order of the named states, its columns in that of the factor."""
     n = phi.shape[0]
@@ -317,7 +317,7 @@ def image(model: Model, a: Array, b: Array, fade: float, phi: Array) -> None:
         phi[K + B + i, i] = fade if model.fades[i] > 0.0 else 1.0
 
 
-@compiled
+@exact
 def anchor(model: Model, carry: Carry, lu: Array, order: Order, x: Array) -> None:
     """Begin a window at the present epoch: V = phi^{-T} U, eta := 0, s := x, phi := I."""
     n = x.size
@@ -359,7 +359,7 @@ def anchor(model: Model, carry: Carry, lu: Array, order: Order, x: Array) -> Non
     carry.clock[2] = 0.0
 
 
-@compiled
+@exact
 def doubt(model: Model, carry: Carry, group: int, phi: Array, scratch: Array, std: Array) -> None:
     """Note that the filter is to be doubted about a group of states: ten times its variance, from the next step on."""
     image(model, carry.a, carry.b, carry.fade[0], phi)
@@ -373,14 +373,14 @@ def doubt(model: Model, carry: Carry, group: int, phi: Array, scratch: Array, st
         carry.doubt[group, i] = 9.0 * std[at] * std[at]
 
 
-@compiled
+@exact
 def wrapped(angle: float) -> float:
     """The angle in [-pi, pi]."""
     turned: float = angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
     return turned
 
 
-@compiled
+@exact
 def named(model: Model, x: Array, q: Array, rotated: bool, out: Array) -> None:
     """Fill ``out`` (k, n) with the named states in their own order, Euler angles in place of the rotation.
 

@@ -12,12 +12,12 @@ from estimator.extended import EPS, B, K
 from estimator.rotation import euler, euler_jacobian, exponential, turn
 from estimator.separated.structures import Known, Rows, Split
 from estimator.sweeps import state
-from estimator.ud import Array, Order, agee_turner, compiled, factor, mwgs, solve
+from estimator.ud import Array, Order, agee_turner, factor, mwgs, part, solve
 
 ud.follow(__file__, rotation.__file__, sweeps.__file__)
 
 
-@compiled
+@part
 def absorb(ut: Array, d: Array, ub: Array, db: Array, row: Array, own: Array, weight: float) -> float:
     """Absorb a scalar, first by the state filter, then what is left of it by the bias filter.
 
@@ -33,7 +33,7 @@ def absorb(ut: Array, d: Array, ub: Array, db: Array, row: Array, own: Array, we
     return square
 
 
-@compiled
+@part
 def place(s: Array, v: Array, b: Array, star: Array, a: Array, fade: float, fades: Array, x: Array) -> None:
     """Fill ``x`` (m,) with s + v b + phi x*; ``b`` (k,), ``star`` (m,)."""
     m = s.size
@@ -50,7 +50,7 @@ def place(s: Array, v: Array, b: Array, star: Array, a: Array, fade: float, fade
         x[i] = t
 
 
-@compiled
+@part
 def unplace(x: Array, lu: Array, order: Order, fade: float, fades: Array, star: Array, kin: Array) -> None:
     """Fill ``star`` (m, c) with phi^{-1} x, both (m, c); ``lu``, ``order``: of its block; ``kin`` (7, c): scratch."""
     base = x.shape[0] - K
@@ -63,7 +63,7 @@ def unplace(x: Array, lu: Array, order: Order, fade: float, fades: Array, star: 
             star[base + i, c] = kin[i, c]
 
 
-@compiled
+@part
 def moved(v: Array, star: Array, a: Array, fade: float, fades: Array, out: Array) -> None:
     """Fill ``out`` (m, c) with v + phi X*, ``star`` (m, c)."""
     m, count = v.shape
@@ -83,7 +83,7 @@ def moved(v: Array, star: Array, a: Array, fade: float, fades: Array, out: Array
                     row[c] += t * star[base + j, c]
 
 
-@compiled
+@part
 def named_rows(q: Array, x: Array, m7: Array, work: Array) -> None:
     """Fill ``m7`` (7, 7) with d(h, u, v, w, theta, phi, psi)/d(h, V, a) at ``x`` (7,) about ``q``."""
     e, angles, now = work[0:9].reshape(3, 3), work[9:12], work[12:16]
@@ -103,7 +103,7 @@ def named_rows(q: Array, x: Array, m7: Array, work: Array) -> None:
     m7[4:7, 4:7] = e
 
 
-@compiled
+@part
 def turned(m7: Array, v: Array, base: int, out: Array) -> None:
     """Fill ``out`` (7, c) with ``m7`` times the rows of ``v`` from ``base`` on; most of ``m7`` is zero."""
     for i in range(K):
@@ -116,7 +116,7 @@ def turned(m7: Array, v: Array, base: int, out: Array) -> None:
                     own[c] += t * row[c]
 
 
-@compiled
+@part
 def add_parameters(split: Split, v: Array, ub: Array, db: Array, cross: bool, w: Array, std: Array) -> None:
     """Add V M V^T, if ``cross``, to the variances of the moving states and fill in the parameters', then take roots.
 
@@ -146,7 +146,7 @@ def add_parameters(split: Split, v: Array, ub: Array, db: Array, cross: bool, w:
         std[i] = np.sqrt(std[i])
 
 
-@compiled
+@part
 def anchor(split: Split, known: Known, rows: Rows, keep: bool, lu: Array, order: Order) -> None:
     """Begin a window: U := phi^{-T} U, s := x~, v := V, all data 0, phi := I; ``lu``, ``order`` are overwritten."""
     m, k = known.v.shape
@@ -186,7 +186,7 @@ def anchor(split: Split, known: Known, rows: Rows, keep: bool, lu: Array, order:
     known.clock[1] += 1
 
 
-@compiled
+@part
 def noise(split: Split, e6: Array, fade: float, c: int, e: Array) -> None:
     """Fill ``e`` (m,) with phi^{-1} Gam of noise component ``c``."""
     e[:] = 0.0
@@ -198,7 +198,7 @@ def noise(split: Split, e6: Array, fade: float, c: int, e: Array) -> None:
         e[at] = 1.0 / fade if split.fades[at] > 0.0 else 1.0
 
 
-@compiled
+@part
 def estimate(
     ut: Array, b: Array, s: Array, v: Array, a: Array, fade: float, fades: Array, column: Array, star: Array, x: Array
 ) -> None:

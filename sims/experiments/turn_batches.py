@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from estimator.cubature import kernels
 from estimator.cubature.arrays import copy
 from estimator.cubature.compile import woven
-from estimator.cubature.reflections import strict
 from estimator.parallel import processors
 from estimator.rivals import ckf, covariance, ekf
-from estimator.ud import Array, compiled, follow
+from estimator.ud import Array, compiled, follow, lean
 from sims.experiments import coordinated_turn
 from sims.experiments.coordinated_turn import (
     FIRST,
@@ -150,12 +149,12 @@ def _radar(x: Array) -> Any:
     return radar(x)
 
 
-@strict
+@lean
 def _filtered(x: Array, s: Array, z: Array, of: Factors, work: Any, new: Array, new_s: Array) -> Any:
     return kernels.filter_step(_turn, _radar, None, x, s, z, of[1], of[2], TURNS, work, new, new_s)
 
 
-@strict
+@lean
 def _smoothed(
     x: Array, s: Array, of: Factors, newer: Array, newer_s: Array, work: Any, spare: Array, spare_s: Array
 ) -> Any:
@@ -186,12 +185,12 @@ def _square_root(_: int, x: Array, s: Array, z: Array, of: Factors, work: Any, n
     return _filtered(x, s, z, of, work, new, new_s)
 
 
-@strict
+@lean
 def _again(_: int, x: Array, s: Array, z: Array, of: Factors, work: Any, new: Array, new_s: Array) -> Any:
     return kernels.backward_smoothing_step(_turn, _radar, None, x, s, z, of[1], of[2], TURNS, work, new, new_s)
 
 
-@strict
+@lean
 def _iterated(code: int, x: Array, s: Array, z: Array, of: Factors, work: Any, new: Array, new_s: Array) -> Any:
     return kernels.diplf_step(_turn, _radar, None, x, s, z, of[1], of[2], TURNS, work, new, new_s, code)
 

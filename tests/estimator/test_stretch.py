@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +22,7 @@ from estimator.models.flight_path import FlightPath, Settings
 from estimator.stretch import BLOCK, KEPT, Diverged, Stretch
 
 S = 1_000_000_000
+ROOT = Path(__file__).parents[2]
 FLIGHT = FlightPath.of(Settings.mems(mode="G", earth="flat"), 0.8, 500.0)
 START = {"h": 500.0, "u": 50.0, "theta": 0.05, "psi": 0.3}
 
@@ -192,3 +197,22 @@ def test_a_measurement_between_two_inertial_samples_counts_at_its_own_time(offse
     known = filtered.innovation[:, VELOCITY]
     assert np.nanmax(np.abs(known)) < 1e-6
     assert np.isfinite(known).sum() == len(fixes)
+
+
+FIRST_FLIGHT = """
+import hashlib
+from tests.estimator.test_stretch import advanced, begun, drive
+for told in advanced(begun(), drive(400)):
+    print(hashlib.sha256(told.tobytes()).hexdigest())
+"""
+
+
+def test_the_first_flight_on_a_machine_is_that_of_all_later_ones(tmp_path):
+    """In the first process the kernels are compiled, in the second they come from the disk."""
+    command = [sys.executable, "-c", FIRST_FLIGHT]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run(command, env=environment, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+        for _ in range(2)
+    )
+    assert first and first == second

@@ -1,12 +1,17 @@
 """The U-D kernels do what the dense formulas say, and keep doing it where the dense formulas fail."""
 
+import importlib
+import pkgutil
+import types
 from fractions import Fraction
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba.core.dispatcher import Dispatcher
 
+import estimator
 from estimator import ud
 
 seeds = st.integers(0, 2**32 - 1)
@@ -172,3 +177,32 @@ def test_compiled_code_is_forgotten_when_what_it_calls_has_changed(tmp_path):
         ud.follow(str(caller), str(callee))
         assert index.exists() != changed
         assert other.exists()
+
+
+def kernels():
+    for module in pkgutil.walk_packages(estimator.__path__, "estimator."):
+        for name, kernel in vars(importlib.import_module(module.name)).items():
+            if isinstance(kernel, Dispatcher) and "rivals" not in kernel.py_func.__module__:  # they fly with nobody
+                yield f"{module.name}.{name}", kernel
+
+
+def called(kernel):
+    function = kernel.py_func
+    for name in function.__code__.co_names:
+        callee = function.__globals__.get(name)
+        if isinstance(callee, types.ModuleType):  # module.kernel: any of its names may be meant
+            yield from (vars(callee)[n] for n in function.__code__.co_names if n in vars(callee))
+        else:
+            yield callee
+
+
+def test_what_a_kernel_calls_is_rounded_one_way():
+    """Reassociated code that is not inlined is one thing in the process that compiles it, another in later ones."""
+    found = 0
+    for name, kernel in kernels():
+        for callee in called(kernel):
+            if isinstance(callee, Dispatcher) and callee.targetoptions.get("fastmath"):
+                assert callee.targetoptions.get("forceinline"), f"{name} calls {callee.py_func.__name__}"
+                assert kernel.targetoptions.get("fastmath"), f"{name} is not exact: it calls {callee.py_func.__name__}"
+                found += 1
+    assert found
