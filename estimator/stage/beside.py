@@ -6,6 +6,9 @@ place among the other messages is not.
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,7 +32,7 @@ class Beside:
     """
 
     def __init__(self, thread: bool) -> None:
-        self._pool = ThreadPoolExecutor(1, "beside") if thread else None
+        self._pool = ThreadPoolExecutor(1, "beside", _make_way) if thread else None
         self._asked = ThreadPoolExecutor(1, "asked") if thread else None  # an answer is due sooner than a long window
         self._waiting: deque[Future[list[Message]]] = deque()
 
@@ -63,3 +66,10 @@ class Beside:
 
 def _whole(job: Job) -> list[Message]:
     return list(job())
+
+
+def _make_way() -> None:
+    """Let this thread have what of the processors the flight leaves; elsewhere than on Linux it takes its share."""
+    if sys.platform == "linux":  # where a thread has a priority of its own
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import zenoh
@@ -13,7 +13,7 @@ from telemetry.bus.age import Age
 from telemetry.bus.ancestry import Ancestry
 from telemetry.bus.feed import LARGEST, Answer, Feed, Payload
 from telemetry.bus.publisher import LEFT, MSGPACK
-from telemetry.messages import Event, Health, Message, event
+from telemetry.messages import Event, Health, Message, Progress, event
 from telemetry.wire import decode, encode, schema
 
 if TYPE_CHECKING:
@@ -58,6 +58,24 @@ class Life:
         yield from self._first
         self._first = []
         yield from self._messages
+
+
+def newest_progress(messages: Iterable[Message]) -> Iterator[Message]:
+    """What has come by now, and at its end how far that reaches: the last word about it says all that others did.
+
+    So who has fallen behind catches up in few large batches, not in many small ones.
+    """
+    newest: Progress | None = None
+    for message in messages:
+        if not isinstance(message, Progress):
+            yield message
+        elif message.final:
+            newest = None
+            yield message
+        else:
+            newest = message
+    if newest is not None:
+        yield newest
 
 
 class _Input:
@@ -220,7 +238,7 @@ class Subscription:
                 _, feed = one.run
                 yield from self._drain(one, hold)
                 self._inquire(one)
-                for message in () if hold else feed.ready(TURN):
+                for message in () if hold else newest_progress(feed.ready(TURN)):
                     idle = False
                     one.age.add(message)
                     yield message

@@ -41,6 +41,7 @@ TICK = 0.1  # s between two looks at what is due
 PIECES = 1024  # in a batch, at most
 TURN = 256 << 10  # bytes of one channel before the others have their turn,
 COST = 1 << 10  # a piece counting as so many more
+TOGETHER = 16  # batches handed out as one where the consumer has fallen behind: it catches up the sooner
 QUIET = 0.25  # s of silence after which an empty batch is handed out
 LAST_ROUNDS = 64  # turns of each after the stop
 
@@ -188,11 +189,11 @@ class Receiver:
             with self._ready:
                 if not self._queue and not self._done:
                     self._ready.wait(0.1)
-                frames = self._queue.popleft() if self._queue else None
-                if frames is not None:
-                    self._queued -= _size(frames)
-                elif self._done:
+                waiting = [self._queue.popleft() for _ in range(min(len(self._queue), TOGETHER))]
+                self._queued -= sum(map(_size, waiting))
+                if not waiting and self._done:
                     break
+            frames = join(waiting) if waiting else None
             if frames is not None and len(frames.data):
                 last = time.monotonic()
             elif idle is not None and last is not None and time.monotonic() - last > idle:

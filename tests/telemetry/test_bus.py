@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -18,7 +19,7 @@ import zenoh
 from telemetry.bus import Bus, chunk, publish, serve
 from telemetry.bus import subscription as subscription_module
 from telemetry.messages import Altitude, Event, Health, Imu, Progress, event
-from telemetry.wire import encode
+from telemetry.wire import encode, schema
 
 
 def stream(n: int, source: str = "ingest"):
@@ -163,13 +164,13 @@ def test_finish_says_when_a_consumer_does_not_follow():
 def stranger(bus: Bus, numbers, *, instance: str = "0" * 24, stage: str = "ingest"):
     """A publisher that numbers as it likes and has no history."""
     token = bus.token("alive", stage, instance, "-")
-    (message,) = stream(0)
+    (final,) = stream(0)
     for number in numbers:
-        payload = encode(msgspec.structs.replace(message, sequence=number, final=number == max(numbers)))
+        message = msgspec.structs.replace(final if number == max(numbers) else event("x", t=0, t_rx=0), sequence=number)
         bus.session.put(
-            f"{bus.root}/{stage}/0/event/progress",
-            payload,
-            encoding=zenoh.Encoding("application/msgpack").with_schema("sortie.Progress.v1"),
+            f"{bus.root}/{stage}/0/{message.family}/{message.stream}",
+            encode(message),
+            encoding=zenoh.Encoding("application/msgpack").with_schema(schema(type(message))),
             attachment=f"{instance} {number}",
         )
     return token
@@ -257,6 +258,27 @@ def test_a_consumer_that_does_not_keep_up_holds_up_who_publishes_and_loses_nothi
         subscription.close()
     assert done == list(range(20_001))
     assert max(held) < 10_000, "it waits in the publisher, not in memory"
+
+
+def test_who_has_fallen_behind_is_told_all_samples_and_at_last_how_far_they_reach():
+    with Bus("s") as bus:
+        publisher = bus.publisher("ingest")
+        for message in stream(600):
+            publisher.put(message)
+            if not isinstance(message, Progress):
+                far = Progress(vehicle=0, source="ingest", boot=0, t=message.t, t_rx=message.t_rx, final=False)
+                publisher.put(far)
+        subscription = bus.subscribe("record", ["ingest"])
+        received = [m for m in subscription if m is not None and m.source != "record"]
+        assert publisher.finish()
+        subscription.close()
+    samples = [int(m.t_rx[0]) for m in received if not isinstance(m, Progress)]
+    reached = [m for m in received if isinstance(m, Progress)]
+    assert samples == list(range(600))
+    assert 0 < len(reached) < 60 and [m.final for m in reached] == [False] * (len(reached) - 1) + [True]
+    for before, after in pairwise(received):
+        if isinstance(before, Progress) and not before.final:
+            assert after.t_rx[0] >= before.t_rx[0], "a progress covers what came before it, and no more"
 
 
 def test_a_payload_that_is_no_message_is_refused_and_told():

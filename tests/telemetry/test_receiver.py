@@ -196,6 +196,21 @@ def test_a_silence_is_told_by_empty_batches_and_what_follows_is_later():
     assert all(b > a for a, b in pairwise(silent + ends))
 
 
+def test_a_consumer_that_was_busy_gets_all_that_has_come_meanwhile_in_one_batch():
+    port, sender = free_port(), Sender()
+    source = Receiver([f"udpin:{port}"], DIALECT, batch=0.001)
+    with datagrams() as sock:
+        for number in range(12):
+            sock.sendto(sender.attitude(number), (LOOPBACK, port))
+            time.sleep(0.02)
+        time.sleep(0.1)
+        source.stop()
+    got = [batch for batch in source.batches() if len(batch)]
+    source.join()
+    assert sum(map(len, got)) == 12
+    assert len(got) <= 2  # the empty ones of a silence count among those that are handed out together
+
+
 def test_sixteen_endpoints_are_the_most():
     with pytest.raises(ValueError, match="17 endpoints: 1 to 16 can be received"):
         Receiver([f"udpin:{port}" for port in range(20001, 20018)], DIALECT)
