@@ -60,6 +60,9 @@ LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 SEVERITIES = ("CRITICAL", "CRITICAL", "CRITICAL", "ERROR", "WARN", "INFO", "INFO", "DEBUG")
 
 
+SETTLED = 30.0  # s after the beginning, when vehicles are in flight and it is known how late their samples come
+
+
 class Ages:
     """How old things were, counted in steps of one per cent: constant memory, however many."""
 
@@ -82,6 +85,10 @@ class Ages:
         place = int(np.searchsorted(np.cumsum(self._counts), share * self._counts.sum()))
         return min(self.LEAST * math.exp(place * self.STEP), self.max)
 
+    def told(self) -> Age:
+        """What is said of all of them."""
+        return Age(p50=self.quantile(0.5), p99=self.quantile(0.99), max=self.max)
+
 
 class Books:
     """Counts what passes by.
@@ -100,7 +107,7 @@ class Books:
         self._clocks: dict[tuple[int, int], Clock] = {}
         self._links: dict[tuple[int, str], Account] = {}
         self._bytes: dict[str, ByteAccount] = {}
-        self._ages = Ages()
+        self._ages, self._settled = Ages(), Ages()
         self._consumers: dict[tuple[str, str], Consumer] = {}
 
     def vehicle(self, number: int) -> Vehicle:
@@ -127,7 +134,10 @@ class Books:
             case Estimate():
                 self._estimate(message)
                 if now is not None:
-                    self._ages.add((now - int(t_rx[-1])) / 1e9)
+                    age = (now - int(t_rx[-1])) / 1e9
+                    self._ages.add(age)
+                    if t_rx[-1] - whole.t_rx0 > SETTLED * 1e9:
+                        self._settled.add(age)
             case Window():
                 whole.windows.append(smoothed(message))
             case Report():
@@ -181,7 +191,8 @@ class Books:
         whole.byte_accounts = [self._bytes[key] for key in sorted(self._bytes)]
         whole.consumers = [self._consumers[key] for key in sorted(self._consumers)]
         if self._ages.quantile(0.5) < 3600.0:  # else the stream was not live
-            whole.age = Age(p50=self._ages.quantile(0.5), p99=self._ages.quantile(0.99), max=self._ages.max)
+            whole.age = self._ages.told()
+            whole.settled = self._settled.told() if self._settled.max > -math.inf else None
         return whole
 
     def _level(self, level: str) -> None:

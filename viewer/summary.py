@@ -221,6 +221,8 @@ class Summary(msgspec.Struct, kw_only=True):
         Latitude, longitude (degrees), altitude (m) of the map's zero.
     events : dict of str to int
         Events by level.
+    age, settled : Age or None
+        Of all live estimates; of those from 30 s after the beginning, when their wait has adapted to the telemetry.
     alarms : list of str
         What went wrong while writing.
     messages, rows : int
@@ -247,6 +249,7 @@ class Summary(msgspec.Struct, kw_only=True):
     reports: list[Worth] = []
     events: dict[str, int] = {}
     age: Age | None = None
+    settled: Age | None = None
     alarms: list[str] = []
 
 

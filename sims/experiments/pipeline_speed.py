@@ -3,7 +3,7 @@
 Several vehicles are sent over UDP in real time to ``sortie live``, or to ``sortie ingest``, ``estimate`` and
 ``record`` in three processes. What was sent is held against what was received, by the loss accounts and by the kernel;
 what every process cost, how its memory grew and how old the estimates were when they were recorded is measured from
-outside. The first `SETTLE` seconds, in which filters begin and code is compiled, count for nothing but the losses.
+outside. The first `SETTLE` seconds, in which filters begin, count for nothing but the losses.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Processes = Literal[1, 3]
 Tell = Callable[[str], None]
 
-SETTLE = 30.0  # s
+SETTLE = 30.0  # s; ages are counted from there on, or all where it is never reached
 AGE = 0.05  # s: the target for the 99th percentile
 GROWTH = 0.05  # share of its memory by which a process may grow per minute and still be called flat
 LAG = 0.005  # s that a sample waits for older ones where none is late
@@ -435,7 +435,7 @@ def _drops(ports: set[int]) -> int:
 
 def _row(folder: Path, load: Load, sent: Sent, watch: _Watch, processes: Processes, settle: float) -> Row:
     told: dict[str, Any] = json.loads((folder / "report.json").read_text())
-    accounts, octets, age = told["accounts"], told["byte_accounts"], told.get("age") or {}
+    accounts, octets, age = told["accounts"], told["byte_accounts"], told.get("settled") or told.get("age") or {}
     names = list(watch.seen[-1][1])
     return Row(
         processes=processes,

@@ -16,6 +16,7 @@ from rich.console import Console
 from telemetry import messages as m
 from tests.viewer import flight as f
 from tests.viewer.recordings import everything, grown, rerun
+from viewer.books import Books
 from viewer.comparison import stored
 from viewer.plot import plot
 from viewer.reading import Reading
@@ -363,3 +364,17 @@ def test_plain_numbers_are_sent_as_the_archetypes_send_them():
             assert str(a.component_descriptor()) == str(b.component_descriptor())
             assert a.as_arrow_array().type == b.as_arrow_array().type
             assert repr(a.as_arrow_array().to_pylist()) == repr(b.as_arrow_array().to_pylist())
+
+
+def test_the_age_of_estimates_is_told_with_and_without_the_first_half_minute():
+    books = Books("s", 1.0)
+    estimates = [message for message in f.flight() if isinstance(message, m.Estimate)]
+    rows = [f.sliced(message, slice(i, i + 1)) for message in estimates for i in range(len(message.t))]
+    rows.sort(key=lambda row: int(row.t_rx[0]))
+    begin = int(rows[0].t_rx[0])
+    for row in rows:
+        waited = 400_000_000 if row.t_rx[0] - begin <= 30e9 else 20_000_000
+        books.add(row, int(row.t_rx[0]) + waited)
+    summary = books.close("complete", [])
+    assert (summary.age.max, summary.settled.max) == (0.4, 0.02)
+    assert summary.settled.p99 == pytest.approx(0.02, rel=0.01)
