@@ -12,6 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import TypeVar
 
 from telemetry.messages import Message
@@ -69,7 +70,10 @@ def _whole(job: Job) -> list[Message]:
 
 
 def _make_way() -> None:
-    """Let this thread have what of the processors the flight leaves; elsewhere than on Linux it takes its share."""
-    if sys.platform == "linux":  # where a thread has a priority of its own
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+    """Let this thread have what of the processors the flight leaves, where a thread has a priority of its own."""
+    if sys.platform != "linux":
+        return
+    thread = threading.get_native_id()
+    with suppress(OSError):  # not allowed: then it takes its share
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # also in a process of real-time priority
+        os.setpriority(os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + 10, 19))

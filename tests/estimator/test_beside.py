@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 
 import numpy as np
@@ -125,3 +127,16 @@ def test_a_question_does_not_wait_for_windows():
     go.set()
     assert list(beside.done(all=True)) == []
     beside.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a thread has no priority of its own here")
+def test_windows_make_way_for_the_flight():
+    def nice():
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    said = []
+    jobs = Beside(thread=True)
+    list(jobs.run(lambda: said.append((nice(), os.sched_getscheduler(0))) or ()))
+    list(jobs.done(all=True))
+    jobs.close()
+    assert said == [(min(nice() + 10, 19), os.SCHED_OTHER)]
