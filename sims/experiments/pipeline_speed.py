@@ -315,7 +315,7 @@ class _Stage:
             if self.process.poll() is not None or time.monotonic() > end:
                 raise RuntimeError(f"sortie {self.name} did not begin: {''.join(self._said[-3:]).strip()}")
 
-    def end(self, seconds: float = 120.0) -> None:
+    def end(self, seconds: float = 600.0) -> None:
         """Wait until it has ended by itself."""
         code = self.process.wait(seconds)
         if code:
