@@ -27,6 +27,13 @@ BURST = 0.002
 """Between two looks at the clock (s)."""
 HEAD = 10
 """Bytes of a MAVLink 2 frame before its payload."""
+CLOCKS = {
+    mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: (4, 1_000),
+    mavlink.MAVLINK_MSG_ID_VIBRATION: (8, 1_000),
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS: (4, 1_000_000),
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: (4, 1_000_000),
+}
+"""Bytes and unit (ns) of the time since boot, with which the payload begins, by message."""
 STAGGER = 4_300_000_000
 """By how much each vehicle takes off after the one before (ns): their windows do not all close at once."""
 
@@ -106,13 +113,29 @@ def beside() -> list[bytes]:
     return [bytes(message.pack(packer)) for message in messages]
 
 
+def boot_clock(t: Times, frames: Sequence[bytes]) -> int:
+    """Time since boot, ns, at time 0: from the first frame of the inertial sensors."""
+    for at, frame in zip(t.tolist(), frames, strict=True):
+        if int.from_bytes(frame[7:10], "little") == mavlink.MAVLINK_MSG_ID_HIGHRES_IMU:
+            return int.from_bytes(frame[HEAD : HEAD + 8], "little") * 1000 - int(at)
+    return 0
+
+
+def stamp(body: bytearray, boot: int) -> None:
+    """Write the time since boot, ns, into a frame that tells it: one that stood still would tell of reboots."""
+    field = CLOCKS.get(int.from_bytes(body[7:10], "little"))
+    if field is not None:
+        width, unit = field
+        body[HEAD : HEAD + width] = (boot // unit).to_bytes(width, "little")
+
+
 def encode(load: Load) -> Frames:
     """The frames of all vehicles as they are to be sent."""
     t, base = read(load.flight, load.seconds)
     others = beside()
     wanted = round((load.rate / load.vehicles if load.rate else 0.0) * load.seconds) - len(t)
     extra = np.linspace(0, load.seconds * 1e9, max(wanted, 0), endpoint=False).astype(np.int64)
-    every = np.concatenate([t, extra])
+    every, boot = np.concatenate([t, extra]), boot_clock(t, base)
     bodies = [*base, *(others[i % len(others)] for i in range(len(extra)))]
     order = np.argsort(every, kind="stable").tolist()
     extras = {msgid: bytes([kind.crc_extra]) for msgid, kind in mavlink.mavlink_map.items()}
@@ -122,6 +145,8 @@ def encode(load: Load) -> Frames:
         for sequence, i in enumerate(order):
             body = bytearray(bodies[i][:-2])
             body[4], body[5] = sequence & 255, vehicle
+            if i >= len(base):
+                stamp(body, boot + int(every[i]))
             msgid = body[7] | body[8] << 8 | body[9] << 16
             checksum = crc(bytes(body[1:]) + extras[msgid], 0xFFFF)
             frames.append(bytes(body) + checksum.to_bytes(2, "little"))

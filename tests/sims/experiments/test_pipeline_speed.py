@@ -43,6 +43,19 @@ def test_what_the_flight_does_not_say_is_filled_up_to_the_rate(flight):
     assert (np.diff(frames.t) >= 0).all()
     kinds = {frame[7] for frame in frames.frame}
     assert {mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_VIBRATION} <= kinds
+
+
+def test_the_clock_of_a_vehicle_goes_on_through_everything_it_says(flight):
+    frames = load.encode(told(flight, rate=6000.0))
+    parser, clock = mavlink.MAVLink(None), []
+    for i in np.flatnonzero(frames.sender == 1):
+        message = parser.parse_char(frames.frame[i])
+        if message.get_type() in ("HIGHRES_IMU", "VIBRATION", "SERVO_OUTPUT_RAW"):
+            clock.append(message.time_usec * 1e-6)
+        elif message.get_type() in ("RC_CHANNELS", "LOCAL_POSITION_NED"):
+            clock.append(message.time_boot_ms * 1e-3)
+    assert clock[-1] - clock[0] == pytest.approx(4.0, abs=0.1)
+    assert np.diff(clock).min() > -0.05  # milliseconds are cut off, and a sensor tells when it measured
     inertial = sum(frame[7] == mavlink.MAVLINK_MSG_ID_HIGHRES_IMU for frame in frames.frame)
     assert inertial == pytest.approx(3 * 4 * speed.IMU, abs=6)
 
