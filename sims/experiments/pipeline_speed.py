@@ -9,6 +9,7 @@ outside. The first `SETTLE` seconds, in which filters begin, count for nothing b
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -38,6 +39,7 @@ Tell = Callable[[str], None]
 SETTLE = 30.0  # s; ages are counted from there on, or all where it is never reached
 AGE = 0.05  # s: the target for the 99th percentile
 GROWTH = 0.05  # share of its memory by which a process may grow per minute and still be called flat
+PATIENCE = 300.0  # s that a pipeline has to end after the last message was sent
 LAG = 0.005  # s that a sample waits for older ones where none is late
 PAGE = os.sysconf("SC_PAGE_SIZE")
 TICK = os.sysconf("SC_CLK_TCK")
@@ -85,6 +87,10 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
         From the arrival of the newest sample in an estimate to its recording, s.
     behind : float
         How late the sender was at most, s: ages are worth nothing where that is much.
+    ending : float
+        From the last message sent until all processes had ended by themselves, s, of which the benchmark waits 2 s; a
+        pipeline that cannot follow has work left then. NaN where they had to be killed: nothing is known of what came
+        through, and counts are 0 and ages NaN.
     uses : tuple of Use
     recorded : int
         Bytes of the recordings.
@@ -104,12 +110,15 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     age_p99: float
     age_max: float
     behind: float
+    ending: float
     uses: tuple[Use, ...]
     recorded: int
 
     @property
     def faults(self) -> tuple[str, ...]:
         """What was missed, in words; empty where everything was reached."""
+        if not np.isfinite(self.ending):
+            return ("does not follow",)
         found = []
         if self.received != self.sent or self.lost or self.dropped or self.corrupt:
             found.append("lost")
@@ -133,7 +142,7 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
         table = Table(title="through the pipeline, in real time", title_justify="left")
         for name in (
             "processes", "vehicles", "messages/s", "s", "sent", "received", "lost", "kernel drops", "estimates",
-            "age p50", "p99", "max", "sender late", "verdict",
+            "age p50", "p99", "max", "sender late", "ending", "verdict",
         ):  # fmt: skip
             table.add_column(name, justify="left" if name == "verdict" else "right")
         for row in self.rows:
@@ -141,7 +150,7 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
                 f"{row.processes}", f"{row.vehicles}", f"{row.sent / row.seconds:.0f}", f"{row.seconds:.0f}",
                 f"{row.sent}", f"{row.received}", f"{row.lost}", f"{row.dropped}", f"{row.estimates}",
                 *(f"{age * 1e3:.0f} ms" for age in (row.age_p50, row.age_p99, row.age_max, row.behind)),
-                ", ".join(row.faults) or "good",
+                f"{row.ending:.1f} s", ", ".join(row.faults) or "good",
             )  # fmt: skip
         yield table
         table = Table(title="what each process took", title_justify="left")
@@ -253,13 +262,14 @@ def _run(flight: Flown, vehicles: int, rate: float, seconds: float, processes: P
         sender.wait_ready()
         with _Watch(stages, ports) as watch:
             sent = sender.send()
+            stopped = time.monotonic()
             time.sleep(2.0)
         for stage in stages:
             if stage.name in ("live", "ingest"):
                 stage.process.send_signal(signal.SIGINT)
-        for stage in stages:
-            stage.end()
-        return _row(folder / "sortie", load, sent, watch, processes, settle)
+        ended = all(stage.end(stopped + PATIENCE) for stage in stages)
+        ending = time.monotonic() - stopped if ended else math.nan
+        return _row(folder / "sortie", load, sent, watch, processes, settle, ending)
 
 
 def _start(stack: ExitStack, ports: Sequence[int], folder: Path, config: Path, processes: Processes) -> list[_Stage]:
@@ -315,11 +325,15 @@ class _Stage:
             if self.process.poll() is not None or time.monotonic() > end:
                 raise RuntimeError(f"sortie {self.name} did not begin: {''.join(self._said[-3:]).strip()}")
 
-    def end(self, seconds: float = 600.0) -> None:
-        """Wait until it has ended by itself."""
-        code = self.process.wait(seconds)
+    def end(self, until: float) -> bool:
+        """Whether it ends by itself before a monotonic time."""
+        try:
+            code = self.process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            return False
         if code:
             raise RuntimeError(f"sortie {self.name} ended with {code}: {''.join(self._said[-3:]).strip()}")
+        return True
 
     def __enter__(self) -> _Stage:
         return self
@@ -433,8 +447,12 @@ def _drops(ports: set[int]) -> int:
     return total
 
 
-def _row(folder: Path, load: Load, sent: Sent, watch: _Watch, processes: Processes, settle: float) -> Row:
-    told: dict[str, Any] = json.loads((folder / "report.json").read_text())
+def _row(
+    folder: Path, load: Load, sent: Sent, watch: _Watch, processes: Processes, settle: float, ending: float
+) -> Row:
+    told: dict[str, Any] = {"accounts": (), "byte_accounts": (), "vehicles": ()}
+    if math.isfinite(ending):
+        told = json.loads((folder / "report.json").read_text())
     accounts, octets, age = told["accounts"], told["byte_accounts"], told.get("settled") or told.get("age") or {}
     names = list(watch.seen[-1][1])
     return Row(
@@ -452,6 +470,7 @@ def _row(folder: Path, load: Load, sent: Sent, watch: _Watch, processes: Process
         age_p99=age.get("p99", float("nan")),
         age_max=age.get("max", float("nan")),
         behind=sent.behind,
+        ending=ending,
         uses=tuple(watch.use(name, settle, sent.datagrams / load.seconds) for name in names),
         recorded=sum(path.stat().st_size for path in folder.glob("*.rrd")),
     )

@@ -81,7 +81,7 @@ def row(**given):
     good = {
         "processes": 3, "vehicles": 5, "rate": 0.0, "seconds": 60.0, "sent": 100, "received": 100, "lost": 0,
         "dropped": 0, "corrupt": 0, "estimates": 10, "age_p50": 0.01, "age_p99": 0.04, "age_max": 0.2, "behind": 0.0,
-        "uses": (use,), "recorded": 1,
+        "ending": 3.0, "uses": (use,), "recorded": 1,
     }  # fmt: skip
     return speed.Row(**(good | given))
 
@@ -94,6 +94,18 @@ def test_a_run_is_called_good_only_without_loss_and_with_young_estimates_and_fla
     assert row(age_p99=float("nan")).faults == ("old",)
     growing = speed.Use(name="record", cpu=0.2, per_message=1e-4, memory=1e8, growth=6e6)
     assert row(uses=(growing,)).faults == ("grows",)
+    assert row(ending=float("nan")).faults == ("does not follow",)
+
+
+def test_a_pipeline_that_does_not_end_is_a_row_and_not_the_end_of_the_benchmark(monkeypatch):
+    monkeypatch.setattr(speed, "PATIENCE", 0.0)
+    found = speed.run(vehicles=1, seconds=1.0, settle=0.0, processes=1)
+    (only,) = found.rows
+    assert only.sent > 100 and only.faults == ("does not follow",)
+    said = io.StringIO()
+    for table in found.tables():
+        Console(width=200, file=said).print(table)
+    assert "does not follow" in said.getvalue()
 
 
 def test_three_processes_receive_all_that_is_sent():
@@ -102,6 +114,7 @@ def test_three_processes_receive_all_that_is_sent():
     assert only.sent == only.received > 2000
     assert only.lost == only.dropped == only.corrupt == 0
     assert only.estimates > 100 and only.recorded > 0
+    assert 2.0 < only.ending < speed.PATIENCE
     assert [use.name for use in only.uses] == ["ingest", "estimate", "record"]
     assert all(use.cpu > 0 and use.memory > 1e7 for use in only.uses)
     said = io.StringIO()
