@@ -19,7 +19,6 @@ import gc
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -55,36 +54,6 @@ def new_folder(
     if not os.access(folder, os.W_OK):
         raise Failure(f"{folder} cannot be written to: choose another --folder")
     return name, folder
-
-
-class _Stages:
-    """Threads that run stages on a bus; their first failure is raised when they are joined."""
-
-    def __init__(self) -> None:
-        self.failures: list[Exception] = []
-        self._threads: list[threading.Thread] = []
-
-    def run(self, name: str, function: Callable[[], object]) -> None:
-        def guarded() -> None:
-            try:
-                function()
-            except Exception as error:
-                self.failures.append(error)
-
-        thread = threading.Thread(target=guarded, name=name, daemon=True)
-        thread.start()
-        self._threads.append(thread)
-
-    def check(self) -> None:
-        """Raise the first failure so far, if there is one."""
-        if self.failures:
-            raise self.failures[0]
-
-    def join(self) -> None:
-        """Wait for all, and raise their first failure."""
-        for thread in self._threads:
-            thread.join()
-        self.check()
 
 
 def stop_on_signals(stop: Callable[[], None], what: str = "the window, the recording and the raw log") -> None:
@@ -330,7 +299,10 @@ def follow(
     keep: Callable[[Message], object] | None = None,
     again: bool = False,
 ) -> Summary:
-    """Follow a flight in one process: receive, estimate and record over an embedded bus, until stopped.
+    """Follow a flight in one process: receive, estimate and record in one chain, until stopped.
+
+    Only the receiver, which nothing may hold up, and the smoothing of windows, which takes long, have threads of their
+    own: more of them would take the interpreter from one another.
 
     Parameters
     ----------
@@ -349,41 +321,38 @@ def follow(
         Put the recordings in the place of those of before.
     """
     from estimator.stage import estimate
-    from telemetry.bus import Bus, publish, serve
+    from telemetry.chain import aged, also, expendable, unbroken
+    from telemetry.messages import Estimate
+    from viewer import load
 
-    stages = _Stages()
+    load()
+    failures: list[Exception] = []
+    settings = reception.configuration.estimate
+    flying = expendable("estimate", partial(estimate, settings=settings, beside=True), failures)
     try:
         stop_on_signals(reception.source.stop)
-        with Bus(name) as bus:
-            subscription = bus.subscribe("record", ["ingest", "estimate"], health=True)
-            settings = reception.configuration.estimate
-            flying = partial(estimate, settings=settings, beside=True)
-            stages.run("estimate", lambda: serve(bus, "estimate", ["ingest"], flying))
-            stages.run("ingest", lambda: publish(bus, "ingest", reception.messages(idle)))
-            ready()
+        ready()
+        said = aged(unbroken("ingest", reception.messages(idle), failures), "estimate", "ingest")
+        whole = aged(also(said, flying), "record", "estimate", Estimate)
 
-            def received() -> Iterator[Message]:
-                for message in subscription:
-                    if message is not None:
-                        if keep:
-                            keep(message)
-                        yield message
+        def kept() -> Iterator[Message]:
+            for message in whole:
+                if keep:
+                    keep(message)
+                yield message
 
-            try:
-                told = watch(received(), tell, since=reception.since)
-                properties = {"endpoints": " ".join(reception.endpoints), "estimator": settings.estimator}
-                with only_recorder(folder):
-                    whole = partial(_is_whole, subscription)
-                    summary = record_folder(told, folder, name, properties, finished=whole, again=again)
-                stages.check()
-            except Exception as error:  # what else may be broken, the evidence of the flight is not given up
-                tell(f"ALARM: {error or type(error).__name__}: only the raw log goes on; Ctrl-C ends it")
-                subscription.close()
-                for _ in reception.source.batches(idle):
-                    pass
-                raise
-            subscription.close()
-            stages.join()
+        try:
+            told = watch(kept(), tell, since=reception.since)
+            properties = {"endpoints": " ".join(reception.endpoints), "estimator": settings.estimator}
+            with only_recorder(folder):
+                summary = record_folder(told, folder, name, properties, finished=lambda: not failures, again=again)
+            if failures:
+                raise failures[0]
+        except Exception as error:  # what else may be broken, the evidence of the flight is not given up
+            tell(f"ALARM: {error or type(error).__name__}: only the raw log goes on; Ctrl-C ends it")
+            for _ in reception.source.batches(idle):
+                pass
+            raise
     finally:
         reception.close()
     reception.refuse_loss()

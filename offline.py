@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -64,22 +63,6 @@ def ahead(stream: Iterable[Item], depth: int = 64) -> Iterator[Item]:
     finally:
         stop.set()
         worker.join()
-
-
-def also(messages: Iterable[Message], stage: Callable[[Iterable[Message]], Iterable[Message]]) -> Iterator[Message]:
-    """The messages, and among them what a stage makes of them."""
-    passed: deque[Message] = deque()
-
-    def tap() -> Iterator[Message]:
-        for message in messages:
-            passed.append(message)
-            yield message
-
-    for made in stage(tap()):
-        while passed:
-            yield passed.popleft()
-        yield made
-    yield from passed
 
 
 class Log(NamedTuple):
@@ -208,6 +191,7 @@ def smooth_log(
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeElapsedColumn
 
     from estimator.stage import estimate
+    from telemetry.chain import also
     from telemetry.marks import insert
     from viewer.recorder import record
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from telemetry.bus.ancestry import Lineage
 from telemetry.bus.subscription import GRACE, Life
-from telemetry.messages import Message, Progress, event
+from telemetry.chain import failed
+from telemetry.messages import Message, Progress
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,8 +53,7 @@ def publish(bus: Bus, stage: str, messages: Iterable[Message], lineage: Lineage 
     except BaseException as error:
         now = time.time_ns()
         if not isinstance(error, KeyboardInterrupt):
-            text = f"stage {stage} failed: {str(error).strip() or type(error).__name__}"
-            publisher.put(event(text, level="error", source=stage, t=now, t_rx=now))
+            publisher.put(failed(stage, error))
         times = np.array([now], np.int64)
         publisher.put(Progress(vehicle=0, source=stage, boot=0, t=times, t_rx=times, final=True))
         publisher.finish(GRACE)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import zenoh
 
-from telemetry.bus.age import Age
+from telemetry.age import Age
 from telemetry.bus.ancestry import Ancestry
 from telemetry.bus.feed import LARGEST, Answer, Feed, Payload
 from telemetry.bus.publisher import LEFT, MSGPACK
