@@ -39,6 +39,7 @@ Tell = Callable[[str], None]
 SETTLE = 30.0  # s; ages are counted from there on, or all where it is never reached
 AGE = 0.05  # s: the target for the 99th percentile
 GROWTH = 0.05  # share of its memory by which a process may grow per minute and still be called flat
+LONG = 300.0  # s that a run must take to show whether memory grows: before, the first windows are open
 PATIENCE = 300.0  # s that a pipeline has to end after the last message was sent
 LAG = 0.005  # s that a sample waits for older ones where none is late
 PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -60,7 +61,8 @@ class Use(msgspec.Struct, frozen=True, kw_only=True):
         CPU seconds per message sent.
     memory, growth : float
         Resident bytes at the end, and by how much it grew per minute, from a line through the second half of the run:
-        the first windows of a flight are open until then, and what they hold comes back.
+        the first windows of a flight are open until then, and what they hold comes back. Runs shorter than `LONG` say
+        nothing of it.
     """
 
     name: str
@@ -124,7 +126,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
             found.append("lost")
         if not self.age_p99 < AGE:
             found.append("old")
-        if any(use.growth > GROWTH * use.memory for use in self.uses):
+        if self.seconds >= LONG and any(use.growth > GROWTH * use.memory for use in self.uses):
             found.append("grows")
         return tuple(found)
 
@@ -158,9 +160,10 @@ class Comparison(msgspec.Struct, frozen=True, kw_only=True):
             table.add_column(name, justify="left" if name == "process" else "right")
         for row in self.rows:
             for use in row.uses:
+                growth = f"{use.growth / 1e6:+.1f} MB/min" if row.seconds >= LONG else "too short to tell"
                 table.add_row(
                     f"{row.processes}", f"{row.sent / row.seconds:.0f}", use.name, f"{100 * use.cpu:.0f} %",
-                    f"{use.per_message * 1e6:.0f} us", f"{use.memory / 1e6:.0f} MB", f"{use.growth / 1e6:+.1f} MB/min",
+                    f"{use.per_message * 1e6:.0f} us", f"{use.memory / 1e6:.0f} MB", growth,
                 )  # fmt: skip
         yield table
 

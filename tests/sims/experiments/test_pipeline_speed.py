@@ -93,7 +93,8 @@ def test_a_run_is_called_good_only_without_loss_and_with_young_estimates_and_fla
     assert row(age_p99=0.051).faults == ("old",)
     assert row(age_p99=float("nan")).faults == ("old",)
     growing = speed.Use(name="record", cpu=0.2, per_message=1e-4, memory=1e8, growth=6e6)
-    assert row(uses=(growing,)).faults == ("grows",)
+    assert row(uses=(growing,), seconds=speed.LONG).faults == ("grows",)
+    assert row(uses=(growing,)).faults == (), "windows are still filling"
     assert row(ending=float("nan")).faults == ("does not follow",)
 
 
