@@ -296,7 +296,6 @@ def follow(
     idle: float | None,
     ready: Callable[[], object],
     tell: Callable[[str], None],
-    keep: Callable[[Message], object] | None = None,
     again: bool = False,
 ) -> Summary:
     """Follow a flight in one process: receive, estimate and record in one chain, until stopped.
@@ -315,8 +314,6 @@ def follow(
         Called when everything is listening.
     tell : callable
         Given a line for every event and window.
-    keep : callable, optional
-        Given every message.
     again : bool
         Put the recordings in the place of those of before.
     """
@@ -334,15 +331,8 @@ def follow(
         ready()
         said = aged(unbroken("ingest", reception.messages(idle), failures), "estimate", "ingest")
         whole = aged(also(said, flying), "record", "estimate", Estimate)
-
-        def kept() -> Iterator[Message]:
-            for message in whole:
-                if keep:
-                    keep(message)
-                yield message
-
         try:
-            told = watch(kept(), tell, since=reception.since)
+            told = watch(whole, tell, since=reception.since)
             properties = {"endpoints": " ".join(reception.endpoints), "estimator": settings.estimator}
             with only_recorder(folder):
                 summary = record_folder(told, folder, name, properties, finished=lambda: not failures, again=again)

@@ -20,6 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from apart import follow_apart
 from bench import BENCHMARKS, REPRODUCTIONS
 from configuration import DISTRIBUTION, Estimator, configure, configure_log, read_what_ran
 from live import Reception, follow, make_prompt, new_folder, record_lives, stop_on_signals
@@ -683,7 +684,7 @@ def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED, estimator: Es
 
     import sims
     import sims.accuracy
-    from sims.transmitter import free_port
+    from sims.command import free_port
 
     console = Console(highlight=False, soft_wrap=True)
     name, folder = new_folder(
@@ -700,11 +701,14 @@ def demo(*, folder: Path | None = None, speed: float = DEMO_SPEED, estimator: Es
         target=lambda: sims.send(sims.frames(flight), f"udpout:127.0.0.1:{port}", speed=speed, faults=DEMO_FAULTS),
     )
 
-    def ready() -> None:
-        console.print(f"live: MAVLink over {endpoint} at {speed:g}x real time -> zenoh -> estimator -> {folder}")
+    def ready(bus: str) -> None:
+        console.print(
+            f"live, in three processes: MAVLink over {endpoint} at {speed:g}x real time -> zenoh over {bus} -> "
+            f"estimator -> zenoh -> recording in {folder}"
+        )
         sender.start()
 
-    follow(
+    follow_apart(
         Reception(folder, name, [endpoint], configure(None, estimator=estimator)),
         name,
         folder,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -27,8 +28,9 @@ class Failure(Exception):
 
 
 def say(text: str) -> None:
-    """Tell the user something that is not the result."""
-    print(text, file=sys.stderr, flush=True)
+    """Tell the user something that is not the result; where nobody can hear it any more, the work goes on."""
+    with suppress(OSError, ValueError):  # the terminal is gone, a pipe was closed
+        print(text, file=sys.stderr, flush=True)
 
 
 def counted(number: int, what: str) -> str:

@@ -58,13 +58,6 @@ def parse_endpoint(endpoint: str) -> tuple[str, int]:
     return host or LOOPBACK, int(text)
 
 
-def free_port() -> int:
-    """A UDP port of this machine that nobody listens on."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-        udp.bind((LOOPBACK, 0))
-        return int(udp.getsockname()[1])
-
-
 def send(
     frames: Iterable[Frame],
     endpoint: str,

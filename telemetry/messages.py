@@ -561,7 +561,7 @@ class Report(Message, frozen=True, kw_only=True, eq=False):
 
 
 class Health(Message, frozen=True, kw_only=True, eq=False):
-    """How a consumer on the bus keeps up: a row about every second, `source` being the consumer.
+    """How a consumer keeps up with a stage: a row about every second, `source` being the consumer.
 
     Parameters
     ----------

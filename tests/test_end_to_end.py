@@ -162,6 +162,17 @@ def test_a_recording_that_fails_does_not_take_the_evidence_with_it(flight, tmp_p
     assert (tmp_path / "s" / "raw.tlog").stat().st_size == sent.octets + 8 * sent.datagrams
 
 
+def test_a_flight_is_followed_to_its_end_where_nobody_listens_to_what_is_said_of_it(flight, tmp_path):
+    port, folder = free_port(), tmp_path / "s"
+    with Process("live", f"udpin:127.0.0.1:{port}", "--folder", folder, "--idle", 1.5) as live:
+        live.wait_for("listening")
+        assert live.process.stdout is not None
+        live.process.stdout.close()
+        send(flight, port, until=20)
+        assert live.process.wait(60) == 0
+    assert review(folder)["summary"]["completeness"] == "complete"
+
+
 def test_nothing_received_is_said(tmp_path):
     with Process("live", f"udpin:127.0.0.1:{free_port()}", "--folder", tmp_path / "s") as live:
         live.wait_for("listening")

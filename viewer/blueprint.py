@@ -264,7 +264,7 @@ def _link(root: str, entities: Collection[str], axis: Any, *, alone: bool) -> An
 
 
 def _age_of_all(path: str) -> bool:
-    """Whether it is how old things were when a consumer on the bus had them."""
+    """Whether it is how old things were when a consumer had them."""
     return path.startswith("/health/") and path.endswith("/age")
 
 

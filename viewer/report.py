@@ -202,7 +202,7 @@ def _links(summary: Summary, console: Console) -> None:
         console.print(table)
     if summary.consumers:
         table = _table(
-            "Consumers on the bus", "consumer", "listens to", "worst p99 age>", "max age>", "messages>", "missing>",
+            "Consumers", "consumer", "listens to", "worst p99 age>", "max age>", "messages>", "missing>",
             "backfilled>", "refused>",
         )  # fmt: skip
         for c in summary.consumers:

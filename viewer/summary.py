@@ -187,7 +187,7 @@ class Age(msgspec.Struct, kw_only=True):
 
 
 class Consumer(msgspec.Struct, kw_only=True):
-    """How a consumer on the bus kept up with a stage.
+    """How a consumer kept up with a stage.
 
     Parameters
     ----------

@@ -12,6 +12,7 @@ import json
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -26,9 +27,9 @@ import msgspec
 import numpy as np
 
 import sims
+from sims.command import Command, free_port
 from sims.experiments.pipeline_load import Load, Sent
 from sims.grades import GRADES, Rates
-from sims.transmitter import free_port
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -275,79 +276,23 @@ def _run(flight: Flown, vehicles: int, rate: float, seconds: float, processes: P
         return _row(folder / "sortie", load, sent, watch, processes, settle, ending)
 
 
-def _start(stack: ExitStack, ports: Sequence[int], folder: Path, config: Path, processes: Processes) -> list[_Stage]:
+def _start(stack: ExitStack, ports: Sequence[int], folder: Path, config: Path, processes: Processes) -> list[Command]:
     endpoints = [f"udpin:127.0.0.1:{port}" for port in ports]
     where = folder / "sortie"
     if processes == 1:
-        stages = [_Stage("live", "listening", *endpoints, "--folder", where, "--config", config)]
+        stages = [Command("live", "listening", *endpoints, "--folder", where, "--config", config)]
     else:
-        bus, name = f"tcp/127.0.0.1:{_free_tcp_port()}", ("--sortie", "bench")
+        bus, name = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", ("--sortie", "bench")
         stages = [
-            _Stage("ingest", "listening", *endpoints, *name, "--folder", where, "--listen", bus, "--config", config),
-            _Stage("estimate", "estimating", *name, "--connect", bus, "--config", config),
-            _Stage("record", "recording", where, *name, "--connect", bus),
+            Command("ingest", "listening", *endpoints, *name, "--folder", where, "--listen", bus, "--config", config),
+            Command("estimate", "estimating", *name, "--connect", bus, "--config", config),
+            Command("record", "recording", where, *name, "--connect", bus),
         ]
     for stage in stages:
         stack.enter_context(stage)
     for stage in stages:
         stage.wait()
     return stages
-
-
-def _free_tcp_port() -> int:
-    import socket
-
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as tcp:
-        tcp.bind(("127.0.0.1", 0))
-        return int(tcp.getsockname()[1])
-
-
-class _Stage:
-    """A command in a process of its own."""
-
-    def __init__(self, name: str, ready: str, *arguments: object) -> None:
-        self.name, self._ready = name, ready
-        command = [sys.executable, "-P", "-c", "import sortie; sortie.main()", name, *map(str, arguments)]
-        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        self._said: list[str] = []
-        self._heard = threading.Event()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self._said = [*self._said[-99:], line]
-            if self._ready in line:
-                self._heard.set()
-
-    def wait(self, seconds: float = 120.0) -> None:
-        """Until it says that it is ready."""
-        end = time.monotonic() + seconds
-        while not self._heard.wait(0.05):
-            if self.process.poll() is not None or time.monotonic() > end:
-                raise RuntimeError(f"sortie {self.name} did not begin: {''.join(self._said[-3:]).strip()}")
-
-    def end(self, until: float) -> bool:
-        """Whether it ends by itself before a monotonic time."""
-        try:
-            code = self.process.wait(max(0.0, until - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            return False
-        if code:
-            raise RuntimeError(f"sortie {self.name} ended with {code}: {''.join(self._said[-3:]).strip()}")
-        return True
-
-    def __enter__(self) -> _Stage:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
-        self._reader.join()
-        assert self.process.stderr is not None
-        self.process.stderr.close()
 
 
 class _Sender:
@@ -393,7 +338,7 @@ class _Watch:
         Datagrams that the kernel has thrown away.
     """
 
-    def __init__(self, stages: Sequence[_Stage], ports: Iterable[int]) -> None:
+    def __init__(self, stages: Sequence[Command], ports: Iterable[int]) -> None:
         self._stages, self._ports = stages, set(ports)
         self._stop = threading.Event()
         self.seen: list[tuple[float, dict[str, tuple[float, float]]]] = []
