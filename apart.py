@@ -60,6 +60,11 @@ def follow_apart(
     from telemetry.bus import Bus, publish
 
     at = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+
+    def hear(line: str) -> None:
+        if line.startswith("ALARM"):  # of the recorder; all else comes over the bus
+            tell(line)
+
     on_it = ("--sortie", name, "--connect", at)
     which = ("--estimator", reception.configuration.estimate.estimator)
     failures: list[Exception] = []
@@ -77,29 +82,39 @@ def follow_apart(
         with ExitStack() as stack:
             bus = stack.enter_context(Bus(name, listen=[at], role="router"))
             others = [
-                stack.enter_context(Command("estimate", "estimating", *on_it, *which)),
-                stack.enter_context(Command("record", "recording", folder, *on_it)),
+                stack.enter_context(Command("estimate", "estimating on", *on_it, *which)),
+                stack.enter_context(Command("record", "recording from", folder, *on_it, hear=hear)),
             ]
             stop_on_signals(reception.source.stop)
             for other in others:
-                other.wait()
-            onlooker = threading.Thread(target=look_on, args=(bus.subscribe("onlooker", ["ingest", "estimate"]),))
+                _begun(other)
+            subscription = bus.subscribe("onlooker", ["ingest", "estimate"])
+            onlooker = threading.Thread(target=look_on, args=(subscription,))
             onlooker.start()
             ready(at)
-            publish(bus, "ingest", reception.messages(idle))
-            end = time.monotonic() + PATIENCE
-            bus.linger()
-            amiss = [text for other in others if (text := _amiss(other, end))]
-            onlooker.join()
-    except RuntimeError as error:
-        raise Failure(str(error)) from None
+            try:
+                publish(bus, "ingest", reception.messages(idle))
+            finally:  # where it fails it has said so, and the others close what they have
+                end = time.monotonic() + PATIENCE
+                bus.linger()
+                amiss = [text for other in others if (text := _amiss(other, end))]
+                if amiss:
+                    subscription.stop()
+                onlooker.join()
     finally:
         reception.close()
-    if failures:
-        raise failures[0]
+    reception.refuse_loss()
     if amiss:
         raise Failure("; ".join(amiss))
-    reception.refuse_loss()
+    if failures:
+        raise failures[0]
+
+
+def _begun(other: Command) -> None:
+    try:
+        other.wait()
+    except RuntimeError as error:
+        raise Failure(str(error)) from None
 
 
 def _amiss(other: Command, end: float) -> str:

@@ -158,7 +158,7 @@ class Reception:
             if not resume:
                 write_what_runs(folder, name, endpoints, forward, configuration, self.dialect)
             for trouble in (self.raw_log.error, self.raw_log.warning, *self.raw_log.notes):
-                if trouble:  # nobody hears of it on the bus before something is received
+                if trouble:  # nobody else hears of it before something is received
                     say(f"warning: {trouble}")
         except BaseException:
             self.raw_log.close()
@@ -215,7 +215,7 @@ def record_folder(
     finished: Callable[[], bool],
     again: bool = False,
 ) -> Summary:
-    """Record what comes over the bus into a sortie folder; `again` in place of a recording that it makes void.
+    """Record what stages say into a sortie folder; `again` in place of a recording that it makes void.
 
     `finished` tells in the end whether all stages have said their last.
     """
@@ -329,8 +329,8 @@ def follow(
     try:
         stop_on_signals(reception.source.stop)
         ready()
-        said = aged(unbroken("ingest", reception.messages(idle), failures), "estimate", "ingest")
-        whole = aged(also(said, flying), "record", "estimate", Estimate)
+        said = aged(unbroken("ingest", reception.messages(idle), failures), "live", "ingest")
+        whole = aged(also(said, flying), "live", "estimate", Estimate)
         try:
             told = watch(whole, tell, since=reception.since)
             properties = {"endpoints": " ".join(reception.endpoints), "estimator": settings.estimator}

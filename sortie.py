@@ -13,6 +13,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -797,8 +798,9 @@ def main() -> None:
         # Its threads may be about to ask for the interpreter, and one that goes meanwhile takes the process with it
         # (SIGABRT, after the work is done). Everything of ours is closed by now.
         atexit._run_exitfuncs()
-        sys.stdout.flush()
-        sys.stderr.flush()
+        with suppress(OSError):  # nobody may be listening any more
+            sys.stdout.flush()
+            sys.stderr.flush()
         os._exit(code)
     if code:
         sys.exit(code)

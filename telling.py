@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -29,8 +29,12 @@ class Failure(Exception):
 
 def say(text: str) -> None:
     """Tell the user something that is not the result; where nobody can hear it any more, the work goes on."""
-    with suppress(OSError, ValueError):  # the terminal is gone, a pipe was closed
+    try:
         print(text, file=sys.stderr, flush=True)
+    except (OSError, ValueError):  # the terminal is gone, a pipe was closed: what waits for it would fail again
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        os.close(nowhere)
 
 
 def counted(number: int, what: str) -> str:

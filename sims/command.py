@@ -7,8 +7,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 
 LOOPBACK = "127.0.0.1"
+GRACE = 10.0  # s that it has to close when it is no longer wanted
 # What nobody writes to ends when this process does, however it does: then the command closes, as by Ctrl-C.
 _CODE = """
 import os, signal, threading
@@ -29,8 +31,10 @@ class Command:
     name : str
         The command.
     ready : str
-        A word that it says when it is ready.
+        Words that it says when it is ready.
     *arguments : object
+    hear : callable, optional
+        Given every line that it says, on another thread.
 
     Attributes
     ----------
@@ -38,8 +42,8 @@ class Command:
     process : subprocess.Popen
     """
 
-    def __init__(self, name: str, ready: str, *arguments: object) -> None:
-        self.name, self._ready = name, ready
+    def __init__(self, name: str, ready: str, *arguments: object, hear: Callable[[str], object] | None = None) -> None:
+        self.name, self._ready, self._hear = name, ready, hear
         command = [sys.executable, "-P", "-c", _CODE, name, *map(str, arguments)]
         self.process = subprocess.Popen(
             command,
@@ -60,6 +64,8 @@ class Command:
             self._said = [*self._said[-99:], line]
             if self._ready in line:
                 self._heard.set()
+            if self._hear is not None:
+                self._hear(line.rstrip())
 
     def wait(self, seconds: float = 120.0) -> None:
         """Until it says that it is ready.
@@ -98,8 +104,12 @@ class Command:
 
     def __exit__(self, *_: object) -> None:
         if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
+            self.process.terminate()
+            try:
+                self.process.wait(GRACE)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
         self._reader.join()
         for pipe in (self.process.stdin, self.process.stderr):
             assert pipe is not None

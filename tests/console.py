@@ -11,6 +11,7 @@ from pathlib import Path
 
 SORTIE = Path(sys.executable).parent / "sortie"
 RERUN = Path(sys.executable).parent / "rerun"
+ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}  # as users have it
 
 
 def run(*arguments: object, cwd: Path | None = None, timeout: float = 240) -> subprocess.CompletedProcess[str]:
@@ -25,7 +26,7 @@ class Process:
 
     def __init__(self, *arguments: object, cwd: Path | None = None) -> None:
         self.process = subprocess.Popen(
-            [SORTIE, *map(str, arguments)], cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+            [SORTIE, *map(str, arguments)], cwd=cwd, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )
         assert self.process.stdout is not None
         os.set_blocking(self.process.stdout.fileno(), False)

@@ -202,7 +202,7 @@ def compare(
             for count in processes:
                 if tell:
                     tell(f"{rate:.0f} messages/s, {vehicles} vehicles, {count} processes: {seconds + settle:.0f} s")
-                rows.append(_run(flight, vehicles, rate, seconds, count, settle))
+                rows.append(_run(flight, vehicles, rate, seconds, count, settle, tell))
     return Comparison(machine=machine(), rows=tuple(rows))
 
 
@@ -232,7 +232,7 @@ def run(
         flight = fly(Path(folder) / "flight.tlog", seconds + settle, imu)
         if tell:
             tell(f"{vehicles} vehicles, inertial samples at {imu} Hz, {processes} processes")
-        return Comparison(machine=machine(), rows=(_run(flight, vehicles, 0.0, seconds, processes, settle),))
+        return Comparison(machine=machine(), rows=(_run(flight, vehicles, 0.0, seconds, processes, settle, tell),))
 
 
 class Flown(msgspec.Struct, frozen=True, kw_only=True):
@@ -254,7 +254,9 @@ def machine() -> dict[str, str]:
     return {"cores": str(os.cpu_count()), "python": sys.version.split()[0], "least_lag": f"{LAG:g} s"}
 
 
-def _run(flight: Flown, vehicles: int, rate: float, seconds: float, processes: Processes, settle: float) -> Row:
+def _run(
+    flight: Flown, vehicles: int, rate: float, seconds: float, processes: Processes, settle: float, tell: Tell | None
+) -> Row:
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
         config = folder / "settings.toml"
@@ -271,7 +273,12 @@ def _run(flight: Flown, vehicles: int, rate: float, seconds: float, processes: P
         for stage in stages:
             if stage.name in ("live", "ingest"):
                 stage.process.send_signal(signal.SIGINT)
-        ended = all(stage.end(stopped + PATIENCE) for stage in stages)
+        try:
+            ended = all(stage.end(stopped + PATIENCE) for stage in stages)
+        except RuntimeError as error:  # e.g. because a consumer did not take everything in time
+            ended = False
+            if tell:
+                tell(str(error))
         ending = time.monotonic() - stopped if ended else math.nan
         return _row(folder / "sortie", load, sent, watch, processes, settle, ending)
 
@@ -280,13 +287,15 @@ def _start(stack: ExitStack, ports: Sequence[int], folder: Path, config: Path, p
     endpoints = [f"udpin:127.0.0.1:{port}" for port in ports]
     where = folder / "sortie"
     if processes == 1:
-        stages = [Command("live", "listening", *endpoints, "--folder", where, "--config", config)]
+        stages = [Command("live", "listening on", *endpoints, "--folder", where, "--config", config)]
     else:
         bus, name = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", ("--sortie", "bench")
         stages = [
-            Command("ingest", "listening", *endpoints, *name, "--folder", where, "--listen", bus, "--config", config),
-            Command("estimate", "estimating", *name, "--connect", bus, "--config", config),
-            Command("record", "recording", where, *name, "--connect", bus),
+            Command(
+                "ingest", "listening on", *endpoints, *name, "--folder", where, "--listen", bus, "--config", config
+            ),
+            Command("estimate", "estimating on", *name, "--connect", bus, "--config", config),
+            Command("record", "recording from", where, *name, "--connect", bus),
         ]
     for stage in stages:
         stack.enter_context(stage)

@@ -1,4 +1,4 @@
-"""The bus: stages hand messages to one another over zenoh, inside one process or between several.
+"""The bus: stages hand messages to one another over zenoh, between processes; without any endpoint, inside one.
 
 Nothing is scouted, and nothing listens unless it is named. Below ``sortie/{sortie}/``:
 

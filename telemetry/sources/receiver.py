@@ -120,6 +120,7 @@ class Receiver:
         self._resolution = 1000 << link_bits(len(self.links))  # ns: in the raw log the bits below are the link number
         self._last = raw_log.reached if raw_log else 0
         self._resumed = self._last > 0
+        self._heard: float | None = None  # when something was last handed out, s
         self._pieces: list[_Piece] = []
         self._oldest = 0.0
         self._streams: dict[Channel, StreamScanner] = {}
@@ -184,7 +185,8 @@ class Receiver:
         Exception
             What ended the receiving thread, if anything did.
         """
-        last = time.monotonic() if self._resumed else None
+        if self._resumed and self._heard is None:
+            self._heard = time.monotonic()
         while True:
             with self._ready:
                 if not self._queue and not self._done:
@@ -195,8 +197,8 @@ class Receiver:
                     break
             frames = join(waiting) if waiting else None
             if frames is not None and len(frames.data):
-                last = time.monotonic()
-            elif idle is not None and last is not None and time.monotonic() - last > idle:
+                self._heard = time.monotonic()
+            elif idle is not None and self._heard is not None and time.monotonic() - self._heard > idle:
                 self.stop()
             if frames is not None:
                 yield frames

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -19,7 +20,7 @@ CARRIES = "import sys, time\nfrom sims.command import Command\n" + (
 
 
 def bus() -> str:
-    return f"tcp/127.0.0.1:{free_port()}"
+    return f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
 
 
 def test_it_is_ready_when_it_says_so_and_ends_by_itself():
