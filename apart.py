@@ -60,14 +60,13 @@ def follow_apart(
     from telemetry.bus import Bus, publish
 
     at = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    on_it = ("--sortie", name, "--connect", at)
+    which = ("--estimator", reception.configuration.estimate.estimator)
+    failures: list[Exception] = []
 
     def hear(line: str) -> None:
         if line.startswith("ALARM"):  # of the recorder; all else comes over the bus
             tell(line)
-
-    on_it = ("--sortie", name, "--connect", at)
-    which = ("--estimator", reception.configuration.estimate.estimator)
-    failures: list[Exception] = []
 
     def look_on(subscription: Any) -> None:
         try:
@@ -111,6 +110,7 @@ def follow_apart(
 
 
 def _begun(other: Command) -> None:
+    """Wait until a process is ready."""
     try:
         other.wait()
     except RuntimeError as error:
@@ -120,10 +120,7 @@ def _begun(other: Command) -> None:
 def _amiss(other: Command, end: float) -> str:
     """Why a process has not ended as it should, if so."""
     try:
-        return (
-            ""
-            if other.end(end)
-            else f"sortie {other.name} did not end: what it has made of the flight may not be whole"
-        )
+        ended = other.end(end)
     except RuntimeError as error:
         return str(error)
+    return "" if ended else f"sortie {other.name} did not end: what it has made of the flight may not be whole"
